@@ -113,7 +113,8 @@ class Autopilot(Source[AutopilotSettings]):
         clock = DeviceClock(settings.clock_drift_limit_ppm, round(1e9 * settings.clock_jump_limit_s))
         self._decoder = FrameDecoder((settings.system_id, settings.component_id), settings.own_id, clock)
         self._session: AutopilotSession | None = None
-        self._signer: Signer | None = None  # used by all sessions
+        self._signer: Signer | None = None  # used by all sessions, as is `_poses`, which knows what the autopilot got
+        self._poses: PoseSender | None = None
         self._not_connected: int = 0
 
     def decode(self, record: Record) -> AutopilotMessage | None:
@@ -165,18 +166,20 @@ class Autopilot(Source[AutopilotSettings]):
         """Open a session on a connection. A simulation in virtual time has its own clock and no thread."""
         settings = self.settings
         target = settings.system_id, settings.component_id
-        self._session = AutopilotSession(
-            connection,
-            target,
-            settings.own_id,
-            PoseSender(
+        if self._poses is None:
+            self._poses = PoseSender(
                 settings.send,
                 settings.limits,
                 reset_counter=now_ns() // 1_000_000_000,
                 yaw=settings.yaw,
                 profile=settings.profile,
                 on_rejection=settings.on_rejection,
-            ),
+            )
+        self._session = AutopilotSession(
+            connection,
+            target,
+            settings.own_id,
+            self._poses,
             OriginSender(settings.global_origin, target),
             MessageIntervals(settings.message_rates, settings.profile, target, settings.own_id),
             self._signer,

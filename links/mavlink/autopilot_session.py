@@ -28,7 +28,7 @@ from typing import Any
 
 from flow.link import LinkError, Record
 from links.mavlink.origin import OriginSender
-from links.mavlink.poses.attitude_monitor import AttitudeEvent, AttitudeMonitor
+from links.mavlink.poses.attitude_monitor import AttitudeEvent
 from links.mavlink.poses.gate import RejectReason
 from links.mavlink.poses.independence import POSES, Independence
 from links.mavlink.poses.pose_sender import PoseSender
@@ -79,7 +79,7 @@ class AutopilotSession:
         self._target, self._own = target, own
         self._signer, self._now_ns = signer, now_ns
         self._received_topic, self._sent_topic = topics
-        self._independence, self._attitude = independence, AttitudeMonitor()
+        self._independence = independence
         self._sent_state = SentState(None, now_ns()) if sent_state is None else sent_state
         self._splitter = FrameSplitter()
         self._split_connection = 0  # `reconnects` of the splitter's bytes
@@ -132,8 +132,9 @@ class AutopilotSession:
             now_ns = self._now_ns()
             self._send_periodic(now_ns)
             messages = self.poses.messages(pose, now_ns, self._link_reason(now_ns))
-            if any([self._send(message) for message in messages]):  # tries all
-                self.poses.on_sent(pose, now_ns)
+            sent = [message for message in messages if self._send(message)]
+            if sent:
+                self.poses.on_sent(pose, now_ns, sent)
             self._send_texts(now_ns)
 
     def sent(self) -> list[Record]:
@@ -245,14 +246,14 @@ class AutopilotSession:
 
     def _on_attitude(self, message: Any, arrival_ns: int) -> None:
         """The autopilot's attitude, and what it shows. The lock is held."""
-        event = self._attitude.add(message, arrival_ns)
+        event = self.poses.attitude.add(message, arrival_ns)
         if event is AttitudeEvent.BOOTED:
             self.poses.on_boot()
             self.origin.restart()
         elif event is AttitudeEvent.YAW_RESET:
             self.poses.on_yaw_reset()
-        if self._attitude.newest is not None:
-            self.poses.on_attitude(self._attitude.newest)
+        if self.poses.attitude.newest is not None:
+            self.poses.on_attitude(self.poses.attitude.newest)
 
     def _accept_for_heartbeats(self, source: tuple[str, int]) -> None:
         """Send heartbeats, but no poses, to an autopilot that signs with an old time until it receives our time.

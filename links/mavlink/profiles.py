@@ -8,7 +8,7 @@ They depend on what the poses contain (`yaw` of the link):
 
 grd is one source set of ArduPilot (`source_set`, EK3_SRC2_* by default); set 1 is the source that flies without grd.
 
-ArduPilot (4.3 to 4.6; EKF3)
+ArduPilot (4.5 to 4.6; EKF3)
 - ODOMETRY only in LOCAL_FRD / BODY_FRD, at 4 Hz or more; healthy for 300 ms after each message. At most one per 20 ms
   is fused (of two closer ones the second is dropped): 25 to 50 Hz is suitable.
 - EK3_SRC_OPTIONS bit 0, on by default, fuses the velocities of all source sets: one of an external pose in another
@@ -151,10 +151,13 @@ def _ardupilot(yaw: YawOutput, source_set: int) -> tuple[RequiredParameter, ...]
             own + "YAW", (1.0, 2.0, 3.0), why="compass or GPS: grd sends no yaw, but positions in its axes"
         ),
     )
+    without_grd = "set 1 flies without grd"
     other = (
-        RequiredParameter(
-            "EK3_SRC1_POSXY", (3.0, 0.0), why="set 1 flies without grd: GPS, or none where there is no GPS"
-        ),
+        RequiredParameter("EK3_SRC1_POSXY", (3.0, 0.0), why=f"{without_grd}: GPS, or none where there is no GPS"),
+        RequiredParameter("EK3_SRC1_VELXY", (3.0, 0.0, 5.0), why=without_grd),
+        RequiredParameter("EK3_SRC1_POSZ", (1.0, 2.0, 3.0), why=without_grd),
+        RequiredParameter("EK3_SRC1_VELZ", (3.0, 0.0), why=without_grd),
+        RequiredParameter("EK3_SRC1_YAW", (1.0, 2.0, 3.0), why=without_grd),
     )
     return (
         RequiredParameter("AHRS_EKF_TYPE", (3.0,), why="only EKF3 fuses an external pose"),

@@ -1,4 +1,4 @@
-"""What a run leaves for people: fixes and poses as TUM trajectories and covariance tables, and the story in words.
+"""What a run leaves for people: fixes and poses as TUM trajectories and covariance tables, and a text log.
 
 Source: DESIGN, Outputs of a run. TUM lines are `stamp_s tx ty tz qx qy qz qw` of T_vehicle_drone.
 """

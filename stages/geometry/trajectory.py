@@ -208,6 +208,12 @@ class VehicleTrajectory:
             yaw_rad += beyond_s * float(np.linalg.norm(turn_radps))
         return position_m, yaw_rad
 
+    def extrapolation_covariance_m2(self, stamp_ns: int, xyz_vehicle_m: Array64) -> Array64:
+        """Covariance (3, 3) [m^2], vehicle axes, of a position (3,) relative to the vehicle, by extrapolation alone."""
+        sigma_m, yaw_rad = self.extrapolation_sigma(stamp_ns)
+        by_yaw = np.array([-xyz_vehicle_m[1], xyz_vehicle_m[0], 0.0]) * yaw_rad
+        return sigma_m**2 * np.eye(3) + np.outer(by_yaw, by_yaw)
+
     def to_vehicle(self, stamp_ns: int, xyz_m: Array64, velocity_mps: Array64) -> tuple[Array64, Array64]:
         """Position (3,) and velocity (3,) relative to the vehicle, in its axes, of map position and velocity.
 

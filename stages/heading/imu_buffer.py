@@ -51,6 +51,10 @@ class ImuBuffer:
         """Whether intervals keep arriving."""
         return bool(self._intervals) and now_ns - self._intervals[-1].stamp_ns < CURRENT_NS
 
+    def clear(self) -> None:
+        """Drop the intervals; the turns by images stay."""
+        self._intervals.clear()
+
     def add(self, motion: DroneMotion) -> bool:
         """Add an interval. False: it is not later than the newest one."""
         newest_ns = self.newest_ns

@@ -27,7 +27,7 @@ class DroneTilt(Message):
 
     up_drone: Vec3  # unit vector
     sigma_rad: float
-    angular_velocity_drone_radps: Vec3 | None  # None: no rate at hand that is independent of poses of grd
+    angular_velocity_drone_radps: Vec3 | None  # None: no rate available that is independent of poses of grd
 
 
 @message(schema=58)

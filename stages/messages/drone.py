@@ -40,7 +40,7 @@ class CandidateEvidence:
 
 
 class SearchResult(enum.Enum):
-    """What one search for the drone found."""
+    """Result of one search for the drone."""
 
     DRONE = "drone"  # at least one accepted candidate
     ALL_REJECTED = "all candidates rejected"
@@ -134,7 +134,7 @@ class TrackState(Message):
 
 @message(schema=35)
 class AutopilotMotion:
-    """The autopilot's own estimate, at hand only while it cannot contain our pose. Frames: see DroneAttitude."""
+    """The autopilot's own estimate, available only while it cannot contain our pose. Frames: see DroneAttitude."""
 
     xyz_odom_m: Vec3
     R_odom_drone: Mat3
@@ -155,5 +155,5 @@ class DroneMotion(Message):
     angular_velocity_drone_radps: Vec3  # mean
     specific_force_noise: float  # white-noise density [m/s^2/sqrt(Hz)] per axis, vibration included
     angular_velocity_noise: float  # white-noise density [rad/s/sqrt(Hz)] per axis, vibration included
-    up_drone: Vec3 | None  # unit vector up, by the autopilot's roll and pitch (never its yaw); None: not at hand
-    autopilot: AutopilotMotion | None  # at stamp_ns; None: not at hand, or not independent of our pose
+    up_drone: Vec3 | None  # unit vector up, by the autopilot's roll and pitch (never its yaw); None: not available
+    autopilot: AutopilotMotion | None  # at stamp_ns; None: not available, or not independent of our pose

@@ -241,7 +241,7 @@ class LikelihoodTrack(Stage[LikelihoodTrackSettings]):
         covariance = R.T @ P[:3, :3] @ R + self._bias_covariance(xyz)
         # a recent return is relative to the vehicle and needs no vehicle pose
         if silent_s > self.settings.coast_after_s:
-            covariance += self._vehicle_covariance_m2(now_ns, xyz)
+            covariance += self._vehicle.extrapolation_covariance_m2(now_ns, xyz)
         track.published_ns = now_ns
         return TrackState(
             stamp_ns=now_ns,
@@ -254,12 +254,6 @@ class LikelihoodTrack(Stage[LikelihoodTrackSettings]):
             velocity_vehicle_mps=velocity,
             covariance_m2=covariance,
         )
-
-    def _vehicle_covariance_m2(self, stamp_ns: int, xyz_vehicle_m: Array64) -> Array64:
-        """Covariance (3, 3) [m^2] of a position due to the extrapolated vehicle pose, vehicle axes."""
-        sigma_m, yaw_rad = self._vehicle.extrapolation_sigma(stamp_ns)
-        level = np.array([-xyz_vehicle_m[1], xyz_vehicle_m[0], 0.0]) * yaw_rad
-        return sigma_m**2 * np.eye(3) + np.outer(level, level)
 
     # one scan pass
 

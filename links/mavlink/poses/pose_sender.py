@@ -16,11 +16,13 @@ Source: ours; ArduPilot AP_VisualOdom (300 ms health), PX4 EKF2 EV_MAX_INTERVAL 
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from links.mavlink.poses.attitude_monitor import AttitudeMonitor
 from links.mavlink.poses.fusion_monitor import FusionMonitor, OnRejection
 from links.mavlink.poses.gate import PoseLimits, RejectReason, reject_reason
 from links.mavlink.poses.pose_messages import landing_target, odometry, vision_position_estimate
@@ -29,6 +31,7 @@ from links.mavlink.poses.position_messages import OwnAttitude, position_odometry
 from links.mavlink.poses.status_texts import StatusTexts
 from links.mavlink.profiles import ProfileName, YawOutput
 from links.mavlink.transport.framing import SEQUENCE
+from stages.geometry.frames import Array64
 from stages.messages import RelativePose
 
 PoseMessage = Literal["odometry", "vision_position_estimate", "landing_target"]
@@ -68,13 +71,18 @@ class PoseSender:
         self._profile: ProfileName = profile
         self._attitude: OwnAttitude | None = None
         self._poses_sent = self._yaw_reset = False  # since the autopilot's boot
-        self._odom_yaw_rad: float | None = None  # of the newest sent position
+        self._odom_yaw_rad: float | None = None  # of the newest pose that had one
         self._other_boot_rad: float | None = None  # yaw of its axes before its newest boot: not valid any more
-        self._sent: SentPose | None = None
+        self._first_map_m: Array64 | None = None  # first position that was sent since the autopilot's boot
+        to_ekf: list[PoseMessage] = [kind for kind in self._kinds if kind != "landing_target"]
+        self._to_ekf: tuple[PoseMessage, ...] = tuple(to_ekf) or self._kinds
+        self._sent: SentPose | None = None  # of `_to_ekf`
+        self._newest_ns: int | None = None  # stamp of the newest pose of which anything was sent
         self._incremented = False  # the reset counter, since `_sent`
         self._sending = False
         self.texts = StatusTexts()
         self.fusion = FusionMonitor(on_rejection)
+        self.attitude = AttitudeMonitor()
 
     @property
     def sending(self) -> bool:
@@ -84,17 +92,19 @@ class PoseSender:
     def messages(self, pose: RelativePose, now_ns: int, link_reason: RejectReason | None = None) -> list[Any]:
         """Messages of one pose; none if the gate rejects it, or with a `link_reason`. Then call `on_sent`."""
         self.texts.on_state(pose.state, pose.reason, now_ns)
+        if pose.odom_yaw_rad is not None:
+            self._odom_yaw_rad = pose.odom_yaw_rad
         reasons: dict[PoseMessage, RejectReason | None] = {
             kind: self._reason(kind, pose, now_ns) or link_reason for kind in self._kinds
         }
         self.rejected.update({reason for reason in reasons.values() if reason is not None})
         sendable: list[PoseMessage] = [kind for kind, reason in reasons.items() if reason is None]
-        if not sendable:
-            reason = next(iter(reasons.values()), None)
+        if not any(kind in sendable for kind in self._to_ekf):
+            reason = next((reasons[kind] for kind in self._to_ekf), None)
             if reason is not None and reason is not RejectReason.NOT_NEWER:  # a newer one was sent
                 self._stop(reason.value)
-            return []
-        self._update_reset_counter(pose, now_ns)
+        else:
+            self._update_reset_counter(pose, now_ns)
         return [self._message(kind, pose) for kind in sendable]
 
     def on_attitude(self, attitude: OwnAttitude) -> None:
@@ -108,7 +118,7 @@ class PoseSender:
     def on_boot(self) -> None:
         """The autopilot has booted: its axes are others, and their yaw has to be learnt again before a pose is sent."""
         self._poses_sent = self._yaw_reset = False
-        self._other_boot_rad, self._odom_yaw_rad = self._odom_yaw_rad, None
+        self._other_boot_rad, self._first_map_m = self._odom_yaw_rad, None
         self.fusion.on_boot()
 
     def on_estimator_status(self, message: Any, now_ns: int) -> None:
@@ -120,10 +130,15 @@ class PoseSender:
             if reset:
                 self.reset_counter = (self.reset_counter + 1) % SEQUENCE
 
-    def on_sent(self, pose: RelativePose, now_ns: int) -> None:
-        """A message of this pose was sent."""
+    def on_sent(self, pose: RelativePose, now_ns: int, sent: Sequence[Any]) -> None:
+        """Messages of this pose that were sent."""
+        self._newest_ns = pose.stamp_ns
+        if not {message.get_type().lower() for message in sent} & set(self._to_ekf):
+            return
         self._sent = SentPose(now_ns, pose.stamp_ns, pose.resets, pose.track_id)
-        self._incremented, self._poses_sent, self._odom_yaw_rad = False, True, pose.odom_yaw_rad
+        self._incremented, self._poses_sent = False, True
+        if self._first_map_m is None and pose.xyz_map_m is not None:
+            self._first_map_m = pose.xyz_map_m
         if not self._sending:
             self._sending = True
             self.texts.on_sending(now_ns)
@@ -156,7 +171,7 @@ class PoseSender:
                 reason = self._axes_reason(pose, now_ns)
         if reason is None and kind != "landing_target" and self.fusion.stopped:
             reason = RejectReason.REJECTED_BY_AUTOPILOT
-        if reason is None and self._sent is not None and pose.stamp_ns <= self._sent.stamp_ns:
+        if reason is None and self._newest_ns is not None and pose.stamp_ns <= self._newest_ns:
             reason = RejectReason.NOT_NEWER
         return reason
 
@@ -167,7 +182,17 @@ class PoseSender:
             return RejectReason.NO_ATTITUDE
         if self._yaw_reset:
             return RejectReason.ODOM_YAW_RESET
-        return RejectReason.ODOM_YAW if pose.odom_yaw_rad == self._other_boot_rad else None
+        if pose.odom_yaw_rad is None or pose.odom_yaw_sigma_rad is None or pose.odom_yaw_rad == self._other_boot_rad:
+            return RejectReason.ODOM_YAW
+        if pose.odom_yaw_sigma_rad * self._moved_m(pose) > self._limits.position_sigma_m:
+            return RejectReason.ODOM_YAW_DISTANCE
+        return None
+
+    def _moved_m(self, pose: RelativePose) -> float:
+        """Horizontal distance from the first position that was sent."""
+        if self._first_map_m is None or pose.xyz_map_m is None:
+            return 0.0
+        return math.hypot(*(pose.xyz_map_m - self._first_map_m)[:2])
 
     def _message(self, kind: PoseMessage, pose: RelativePose) -> Any:
         if kind != "landing_target" and self._yaw == "none":
@@ -181,6 +206,6 @@ class PoseSender:
     def _position_message(self, kind: PoseMessage, pose: RelativePose) -> Any:
         own = self._attitude if self._profile == "ardupilot" else None
         if kind == "odometry":
-            return position_odometry(pose, self.reset_counter, self._limits, own)
+            return position_odometry(pose, self.reset_counter, self._limits, own, self._moved_m(pose))
         assert own is not None  # PX4 has no VISION_POSITION_ESTIMATE
-        return position_vision_estimate(pose, self.reset_counter, own)
+        return position_vision_estimate(pose, self.reset_counter, own, self._moved_m(pose))

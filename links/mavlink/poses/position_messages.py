@@ -41,9 +41,11 @@ class OwnAttitude:
     arrival_ns: int
 
 
-def position_odometry(pose: RelativePose, reset_counter: int, limits: PoseLimits, own: OwnAttitude | None) -> Any:
-    """ODOMETRY of a position that the gate has accepted. `own`: for ArduPilot; None: for PX4."""
-    position = odom_position(pose)
+def position_odometry(
+    pose: RelativePose, reset_counter: int, limits: PoseLimits, own: OwnAttitude | None, moved_m: float = 0.0
+) -> Any:
+    """ODOMETRY of a position that the gate has accepted. `own`: for ArduPilot; None: for PX4. `moved_m`: see there."""
+    position = odom_position(pose, moved_m)
     return dialect().MAVLink_odometry_message(
         pose.stamp_ns // 1000,
         LOCAL_NED if own is None else LOCAL_FRD,
@@ -60,9 +62,9 @@ def position_odometry(pose: RelativePose, reset_counter: int, limits: PoseLimits
     )
 
 
-def position_vision_estimate(pose: RelativePose, reset_counter: int, own: OwnAttitude) -> Any:
-    """VISION_POSITION_ESTIMATE of a position that the gate has accepted; for ArduPilot."""
-    position = odom_position(pose)
+def position_vision_estimate(pose: RelativePose, reset_counter: int, own: OwnAttitude, moved_m: float = 0.0) -> Any:
+    """VISION_POSITION_ESTIMATE of a position that the gate has accepted; for ArduPilot. `moved_m`: see the gate."""
+    position = odom_position(pose, moved_m)
     return dialect().MAVLink_vision_position_estimate_message(
         pose.stamp_ns // 1000,
         *flip_yz(position.xyz_odom_m),

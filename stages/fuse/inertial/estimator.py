@@ -178,10 +178,16 @@ class InertialEstimator:
         self._drop()
 
     def forget(self) -> None:
-        """Drop everything: another map frame, or a contradiction."""
+        """Drop the position and the remembered heading: a contradiction."""
         self._drop()
         self._memory = None
         self._odometry.restart()
+
+    def start_map(self) -> None:
+        """Another map frame begins: drop everything, also what waits for its time."""
+        self.forget()
+        self._waiting.clear()
+        self.imu.clear()
 
     def _drop(self) -> None:
         self.resets += self.known
@@ -199,8 +205,8 @@ class InertialEstimator:
             self.graph.advance(stamp_ns)
             return
         self.heading.advance(stamp_ns)
-        last_ns = stamp_ns if self.rotation_ns is None else self.rotation_ns
-        if not self.imu.is_current(stamp_ns) and stamp_ns - last_ns > FREE_NS:
+        last_ns = max(self.rotation_ns or 0, self.imu.newest_ns or 0)  # newest measurement of a rotation or a turn
+        if last_ns and not self.imu.is_current(stamp_ns) and stamp_ns - last_ns > FREE_NS:
             self.heading.restart_yaw()
             self.rotation_ns = None
 
@@ -217,11 +223,13 @@ class InertialEstimator:
         if fix.bias_covariance_m2 is not None:
             bias = fix.bias_covariance_m2
             whole = bias + e.fix_variance * (fix.covariance_m2 - bias)
-        R = R_map_vehicle
-        return FixCovariance(R @ (whole - bias) @ R.T, R @ bias @ R.T)
+        R, ahead = R_map_vehicle, self._vehicle.extrapolation_covariance_m2(fix.stamp_ns, fix.xyz_vehicle_m)
+        return FixCovariance(R @ (whole - bias + ahead) @ R.T, R @ bias @ R.T)
 
     def _use_fix(self, fix: DroneFix) -> None:
         stamp_ns = fix.stamp_ns
+        if not self._vehicle.in_current_frame(stamp_ns):
+            return
         R_map_vehicle, t = self._vehicle.at(stamp_ns)
         z, covariance = R_map_vehicle @ fix.xyz_vehicle_m + t, self.fix_covariance(fix, R_map_vehicle)
         self.newest_fix_ns = max(stamp_ns, self.newest_fix_ns or stamp_ns)
@@ -235,7 +243,8 @@ class InertialEstimator:
         state = self._at_horizon(stamp_ns)
         v = state.velocity_mps[0]
         noise = covariance.white * self._fix_inflation.factor(stamp_ns) + (self._errors.clock_s**2) * np.outer(v, v)
-        z, noise = z + late_s * v, noise + (0.75 * late_s**2) ** 2 * np.eye(3)
+        measured, z = z, z + late_s * v
+        noise = noise + (0.75 * late_s**2) ** 2 * np.eye(3)
         off = z - state.xyz_m[0]
         nis = mahalanobis2(off, state.covariance[0, POSITION, POSITION] + noise)
         if nis > GATE and self._rejected.add(stamp_ns, off, noise):
@@ -244,15 +253,11 @@ class InertialEstimator:
             return
         if nis <= GATE:
             self._rejected.clear()
-            self.nis, self.fix_ns, self.bias_covariance_m2 = (
-                nis,
-                max(stamp_ns, self.fix_ns or stamp_ns),
-                covariance.bias,
-            )
-        self._add_odometry(stamp_ns, z, float(noise[0, 0] + noise[1, 1]) / 2)
+            self._add_odometry(stamp_ns, measured, float(noise[0, 0] + noise[1, 1]) / 2)
         if self.graph.running:
-            self._add_to_graph(max(stamp_ns, self.stamp_ns), z, noise, nis, state)
+            used = self._add_to_graph(max(stamp_ns, self.stamp_ns), z, noise, nis, state)
         else:
+            used = nis <= GATE
             self.heading.advance(stamp_ns)
             self._add_vertical(self.heading.stamp_ns)
             self.heading.add_position(self.heading.stamp_ns, z, noise)
@@ -260,6 +265,9 @@ class InertialEstimator:
             self._add_ownership(stamp_ns, z, noise, self.heading.position_evidence)
             if self.known and self.decided and self.imu.is_current(stamp_ns):
                 self._start_graph()
+        if used and self.known:
+            self.nis, self.fix_ns = nis, max(stamp_ns, self.fix_ns or stamp_ns)
+            self.bias_covariance_m2 = covariance.bias
 
     def _at_horizon(self, stamp_ns: int) -> InertialState:
         """State at a measurement that is not before the horizon, else at the horizon."""
@@ -269,14 +277,15 @@ class InertialEstimator:
         assert self.heading.bank is not None
         return self.heading.bank.mean()
 
-    def _add_to_graph(self, stamp_ns: int, z: Array64, noise: Array64, nis: float, predicted: InertialState) -> None:
-        if nis <= GATE:
-            self.graph.add_position(stamp_ns, z, noise, predicted)
-        else:
+    def _add_to_graph(self, stamp_ns: int, z: Array64, noise: Array64, nis: float, predicted: InertialState) -> bool:
+        """Add a LiDAR position to the graph, unless it is rejected. Whether it is in the estimate."""
+        used = nis <= GATE and self.graph.add_position(stamp_ns, z, noise, predicted)
+        if not used:
             self.graph.advance(stamp_ns)
         self._add_vertical(self.graph.stamp_ns)
         off = z - predicted.xyz_m[0]
         self._add_ownership(stamp_ns, z, noise, log_evidence(off, predicted.covariance[0, POSITION, POSITION] + noise))
+        return used
 
     def _add_ownership(self, stamp_ns: int, z: Array64, noise: Array64, evidence: float) -> None:
         """Whether the object is the drone; the estimate of another one ends, and nothing is published until it is."""
@@ -289,7 +298,8 @@ class InertialEstimator:
 
     def _start_graph(self) -> None:
         self.graph.start(self.heading.stamp_ns, self.heading.decision())
-        self.heading.stop()
+        if self.graph.running:
+            self.heading.stop()
 
     def _find(self, fix: DroneFix, z: Array64, covariance: FixCovariance) -> None:
         """Start at a LiDAR position."""
@@ -346,6 +356,8 @@ class InertialEstimator:
     def _use_rotation(self, rotation: RelativeRotation) -> None:
         if rotation.R_vehicle_drone is None or rotation.covariance_rad2 is None or not self.known:
             return
+        if not self._vehicle.in_current_frame(rotation.stamp_ns):
+            return
         stamp_ns, e = rotation.stamp_ns, self._errors
         R_map_vehicle = self._vehicle.at(stamp_ns)[0]
         R = R_map_vehicle @ rotation.R_vehicle_drone
@@ -371,8 +383,8 @@ class InertialEstimator:
         self._rejected_rotations.clear()
         quarters = R_map_vehicle @ measure.QUARTERS @ R_map_vehicle.T @ (R @ dR)
         turns = log_rotations(graph.state.R.transpose(0, 2, 1) @ quarters)
-        graph.add_rotation(quarters[int(np.argmin(np.linalg.norm(turns, axis=1)))], covariance)
-        self._rotation_used(rotation)
+        if graph.add_rotation(quarters[int(np.argmin(np.linalg.norm(turns, axis=1)))], covariance):
+            self._rotation_used(rotation)
 
     def _rotation_used(self, rotation: RelativeRotation) -> None:
         assert rotation.covariance_rad2 is not None

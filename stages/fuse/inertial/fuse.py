@@ -96,7 +96,7 @@ class InertialFuse(Stage[InertialFuseSettings]):
         """Pose of the vehicle in `map`."""
         valid = self._intake.is_valid(motion, "vehicle motion", motion.xyz_map_m, motion.R_map_vehicle)
         if valid and self._motions.add_vehicle_motion(motion):
-            self._estimator.forget()
+            self._estimator.start_map()
         yield from self._publish(motion)
 
     def on_drone_motion(self, motion: DroneMotion) -> Poses:
@@ -163,7 +163,7 @@ class InertialFuse(Stage[InertialFuseSettings]):
             return
         fixed = self._motions.map_is_fixed(now_ns)
         if fixed != self._map_was_fixed:  # from now on the map frame moves with the vehicle, or stands
-            self._estimator.forget()
+            self._estimator.start_map()
         self._map_was_fixed = fixed
         self._estimator.pass_time(now_ns)
         heading = at_ns // HEADING_NS > self._published_ns // HEADING_NS
@@ -185,9 +185,8 @@ class InertialFuse(Stage[InertialFuseSettings]):
 
     def _status(self, state: PoseState, reason: str) -> Status:
         e = self._estimator
-        return Status(
-            state, reason, e.newest_fix_ns, self._track_id, e.resets + self._jumps.number, e.nis, e.measured_rotation_ns
-        )
+        measured_ns, resets = e.fix_ns or e.newest_fix_ns, e.resets + self._jumps.number
+        return Status(state, reason, measured_ns, self._track_id, resets, e.nis, e.measured_rotation_ns)
 
     def _known(self, now_ns: int) -> MapEstimate:
         """The estimate propagated to now, with the bias covariances added."""

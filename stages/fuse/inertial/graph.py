@@ -26,6 +26,7 @@ from stages.geometry.frames import Array64
 from stages.geometry.se3 import is_covariance
 from stages.heading.imu_buffer import ImuBuffer
 from stages.heading.inertial_state import ACCEL_WALK, GRAVITY_MPS2, GYRO_WALK, POSITION, ImuIntervals, InertialState
+from stages.kernels.geometry.so3 import exp_rotation
 
 RAISED = (RuntimeError, IndexError, ValueError)  # C++ exceptions through GTSAM's wrapper
 HUBER = 1.345  # [sigma]: 95 % efficient on Gaussian noise
@@ -50,7 +51,14 @@ class InertialGraph:
         self.state = _empty()
 
     def start(self, stamp_ns: int, state: InertialState) -> None:
-        """Start from a state (one row) with its joint covariance."""
+        """Start from a state (one row) with its joint covariance; does not run if that is not valid."""
+        try:
+            self._start(stamp_ns, state)
+        except (*RAISED, np.linalg.LinAlgError):
+            self.recoveries += 1
+            self.stop()
+
+    def _start(self, stamp_ns: int, state: InertialState) -> None:
         params: Any = gtsam.ISAM2Params()
         params.setRelinearizeThreshold(0.01)
         params.relinearizeSkip = 1
@@ -124,6 +132,8 @@ class InertialGraph:
         pieces = self._imu.between(self.stamp_ns, stamp_ns)
         if len(pieces) != 1 or not isinstance(pieces[0], ImuIntervals):
             self.start(stamp_ns, predicted)
+            if not self.running:
+                return False
             if factor is not None:
                 self._pending.append(factor)
             return self._flush()
@@ -157,9 +167,11 @@ class InertialGraph:
         params.setBiasAccCovariance(ACCEL_WALK**2 * three)
         params.setBiasOmegaCovariance(GYRO_WALK**2 * three)
         motion: Any = gtsam.PreintegratedCombinedMeasurements(params, _bias(self.state))
+        accelerometer, gyro = self.state.bias[0, :3], self.state.bias[0, 3:]
         for force, rate, step_s in zip(imu.force_mps2, imu.rate_radps, imu.step_s, strict=True):
-            if step_s > 1e-6:
-                motion.integrateMeasurement(force, rate, float(step_s))
+            if step_s > 1e-6:  # GTSAM: axes at the interval's start; the mean force has those of its middle
+                turned = exp_rotation(0.5 * step_s * (rate - gyro)) @ (force - accelerometer) + accelerometer
+                motion.integrateMeasurement(turned, rate, float(step_s))
         return motion
 
     def _insert(self, values: Any, state: InertialState) -> None:

@@ -32,8 +32,8 @@ def state_of(
         if e.newest_fix_ns is None:
             return PoseState.LOST, tracker
         return PoseState.LOST, f"no LiDAR position for {(now_ns - e.newest_fix_ns) * 1e-9:.1f} s; {tracker}"
-    if e.suspect and e.imu.is_current(now_ns):
-        return PoseState.LOST, "what the LiDAR follows does not move as the IMU measures: another drone?"
+    if e.suspect:
+        return PoseState.LOST, "the tracked object does not move as the drone's IMU measures: is it another drone?"
     age_s = (now_ns - e.fix_ns) * 1e-9
     worst_m = math.sqrt(float(np.linalg.eigvalsh(known.covariance[3:, 3:])[-1]))
     if age_s > limits.lost_after_s:
@@ -56,9 +56,9 @@ def undecided_reason(estimator: InertialEstimator, now_ns: int) -> str:
     """Why the heading is not known."""
     e = estimator
     if not e.imu.is_current(now_ns) and e.rotation_ns is None:
-        return "no IMU"
+        return "no IMU data: request RAW_IMU at 10 Hz or more"
     if not e.is_own and e.heading.decided:
-        return "the LiDAR positions do not move as the IMU measures"
+        return "the tracked object does not move as the drone's IMU measures"
     if e.decided:
-        return "its sigma is beyond the limit"
-    return f"P {e.heading.near_probability:.3f} within 20 deg; manoeuvre"
+        return "its sigma exceeds yaw_sigma_deg: accelerate sideways"
+    return f"P(yaw within 20 deg) {e.heading.near_probability:.3f}: accelerate sideways"

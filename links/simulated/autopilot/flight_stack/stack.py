@@ -67,9 +67,11 @@ class FlightStack:
         self._autopilot, self._start_ns = settings, start_ns
         self.own, self.px4 = (1, 1), s.kind == "px4"
         required = required_parameters(s.kind, "none")
-        self.parameters: dict[str, float] = {
-            w.name: w.values[0] if w.values else max(w.at_least, 0.0) for w in required
-        }
+        fuses_yaw = any(SOURCE_SETS[name].yaw is AidingSource.EXTERNAL for name in s.source_sets[1:])
+        required = required_parameters(s.kind, "measured" if fuses_yaw else "none")
+        self.parameters: dict[str, float] = {parameter.name: parameter.best for parameter in required}
+        if not self.px4:
+            self.parameters["EK3_SRC_OPTIONS"] = float(s.source_options)
         self._downlink = Downlink(settings, start_ns, seed)
         self.streams = self._downlink.streams
         self.origin: tuple[int, int, int] | None = None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega
 
@@ -61,8 +62,9 @@ def test_after_a_yaw_reset_no_position_is_sent_until_the_autopilot_boots():
     sender = PoseSender(("odometry",), PoseLimits(), yaw="none")
     sender.on_attitude(OwnAttitude(0.0, 0.0, 1.0, HOST0))
     sender.on_yaw_reset()  # before the first pose: the yaw is still learnt
-    assert len(sender.messages(good_pose(), HOST0)) == 1
-    sender.on_sent(good_pose(), HOST0)
+    messages = sender.messages(good_pose(), HOST0)
+    assert len(messages) == 1
+    sender.on_sent(good_pose(), HOST0, messages)
     sender.on_yaw_reset()
     assert sender.messages(good_pose(HOST0 + 20 * MS), HOST0 + 20 * MS) == []
     assert sender.rejected == {RejectReason.ODOM_YAW_RESET: 1}
@@ -73,11 +75,66 @@ def test_after_a_yaw_reset_no_position_is_sent_until_the_autopilot_boots():
 def test_after_a_boot_no_position_is_sent_in_the_axes_of_before():
     sender = PoseSender(("odometry",), PoseLimits(), yaw="none")
     sender.on_attitude(OwnAttitude(0.0, 0.0, 1.0, HOST0))
-    assert len(sender.messages(good_pose(), HOST0)) == 1
-    sender.on_sent(good_pose(), HOST0)
+    messages = sender.messages(good_pose(), HOST0)
+    assert len(messages) == 1
+    sender.on_sent(good_pose(), HOST0, messages)
     sender.on_boot()
     same = good_pose(HOST0 + 20 * MS)
     assert sender.messages(same, same.stamp_ns) == []
     assert sender.rejected == {RejectReason.ODOM_YAW: 1}
     learnt_again = good_pose(HOST0 + 40 * MS, odom_yaw_rad=0.01)
     assert len(sender.messages(learnt_again, learnt_again.stamp_ns)) == 1
+
+
+@pytest.mark.parametrize("was_sent", [True, False])
+def test_after_several_boots_no_position_is_sent_in_the_axes_of_the_first(was_sent: bool):
+    sender = PoseSender(("odometry",), PoseLimits(), yaw="none")
+    sender.on_attitude(OwnAttitude(0.0, 0.0, 1.0, HOST0))
+    messages = sender.messages(good_pose(), HOST0)
+    if was_sent:
+        sender.on_sent(good_pose(), HOST0, messages)
+    for boot in range(1, 4):
+        sender.on_boot()
+        same = good_pose(HOST0 + boot * 20 * MS)
+        assert sender.messages(same, same.stamp_ns) == []
+    learnt_again = good_pose(HOST0 + 100 * MS, odom_yaw_rad=0.01)
+    assert len(sender.messages(learnt_again, learnt_again.stamp_ns)) == 1
+
+
+def test_far_from_the_first_position_none_is_sent_without_yaw():
+    """An error of the axes' yaw moves the position by that angle times the distance from the first one."""
+    limits, sigma_rad = PoseLimits(), math.radians(1.0)
+    sender = PoseSender(("odometry",), limits, yaw="none")
+    sender.on_attitude(OwnAttitude(0.0, 0.0, 1.0, HOST0))
+    first = good_pose(odom_yaw_sigma_rad=sigma_rad)
+    sender.on_sent(first, HOST0, sender.messages(first, HOST0))
+    assert first.xyz_map_m is not None
+    limit_m = limits.position_sigma_m / sigma_rad
+    for number, (share, messages) in enumerate(((0.9, 1), (1.1, 0), (0.9, 1)), start=1):
+        xyz_map_m = first.xyz_map_m + np.array([0.0, share * limit_m, 3.0])
+        pose = good_pose(HOST0 + number * 20 * MS, odom_yaw_sigma_rad=sigma_rad, xyz_map_m=xyz_map_m)
+        sent = sender.messages(pose, pose.stamp_ns)
+        assert len(sent) == messages
+        if sent:
+            assert sent[0].pose_covariance[6] > (share * limit_m * sigma_rad) ** 2
+    assert sender.rejected == {RejectReason.ODOM_YAW_DISTANCE: 1}
+
+
+def test_landing_target_alone_is_no_sending_of_poses():
+    sender = PoseSender(("odometry", "landing_target"), PoseLimits(), yaw="none")
+    sender.on_attitude(OwnAttitude(0.0, 0.0, 1.0, HOST0))
+    first = good_pose()
+    sender.on_sent(first, HOST0, sender.messages(first, HOST0))
+    assert sender.sending
+    counter = sender.reset_counter
+    sender.on_yaw_reset()
+    later = good_pose(HOST0 + 20 * MS)
+    messages = sender.messages(later, later.stamp_ns)
+    assert [message.get_type() for message in messages] == ["LANDING_TARGET"]
+    sender.on_sent(later, later.stamp_ns, messages)
+    assert not sender.sending
+    sender.on_boot()
+    again = good_pose(HOST0 + 4000 * MS, odom_yaw_rad=0.5)
+    sender.on_attitude(OwnAttitude(0.0, 0.0, 1.0, again.stamp_ns))
+    assert {message.get_type() for message in sender.messages(again, again.stamp_ns)} == {"ODOMETRY", "LANDING_TARGET"}
+    assert sender.reset_counter == (counter + 1) % 256

@@ -42,7 +42,7 @@ class Flight:
             pose = good_pose(self.now_ns)
             messages = self.sender.messages(pose, self.now_ns)
             if messages:
-                self.sender.on_sent(pose, self.now_ns)
+                self.sender.on_sent(pose, self.now_ns, messages)
             self.counters += [m.reset_counter for m in messages]
             self.texts += [m.text for m in self.sender.due_texts(self.now_ns)]
             sent += len(messages)

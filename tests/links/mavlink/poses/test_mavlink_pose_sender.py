@@ -28,7 +28,7 @@ class Output:
         pose = good_pose(self.now_ns, **changes)
         messages = self.pose_sender.messages(pose, self.now_ns)
         if messages and sent:
-            self.pose_sender.on_sent(pose, self.now_ns)
+            self.pose_sender.on_sent(pose, self.now_ns, messages)
             self.counters += [m.reset_counter for m in messages]
         self.collect()
         return len(messages)

@@ -126,6 +126,30 @@ def test_lidar_positions_of_another_object_end_in_a_state_that_sends_nothing():
     assert {p.state for p in late} == {PoseState.LOST}
 
 
+def test_the_time_of_the_measured_rotation_stands_still_in_a_gap_of_the_lidar():
+    """The autopilot's gate compares it with now: it must not be renewed by the IMU alone."""
+    poses = fly(ImuFlight(kind="fast", seed=2, until_s=12.0, gaps_s=((9.0, 11.0),))).poses
+    coasting = [p for p in poses if 9.5 < seconds(p.stamp_ns) < 10.9 and isinstance(p.estimate, PoseEstimate)]
+    assert len(coasting) > 10
+    assert all(p.rotation_ns is not None and seconds(p.rotation_ns) < 9.1 for p in coasting)
+    before = [p for p in poses if 8.0 < seconds(p.stamp_ns) < 9.0]
+    assert all(p.rotation_ns is not None and p.stamp_ns - p.rotation_ns < 400_000_000 for p in before)
+
+
+def test_an_object_that_is_not_the_drone_stays_lost_when_the_imu_ends():
+    own, other = ImuFlight(kind="fast", seed=7, until_s=18.0), ImuFlight(kind="fast", seed=8, until_s=18.0)
+    stage, states = InertialFuse(), {}
+    theirs = [e for e in other.events() if e[1] == "fix" and seconds(e[2].stamp_ns) >= 8.0]
+    ours = [e for e in own.events() if e[1] != "fix" or seconds(e[2].stamp_ns) < 8.0]
+    for _, port, message in sorted(ours + theirs, key=lambda e: e[0]):
+        if isinstance(message, DroneMotion) and seconds(message.stamp_ns) > 14.0:
+            continue
+        for made in getattr(stage, f"on_{port}")(message):
+            if hasattr(made, "state"):
+                states[round(seconds(made.stamp_ns), 2)] = made
+    assert {p.state for t, p in states.items() if t > 12.5} == {PoseState.LOST}
+
+
 def test_messages_that_are_not_finite_are_rejected_and_counted():
     stage = InertialFuse()
     for _, port, message in ImuFlight(kind="fast", seed=2, until_s=2.0).events():

@@ -27,8 +27,28 @@ WINDOW_NS = 10_000_000_000
 LEAST_POINTS, LEAST_M = 4, 1.0
 FIX_FLOOR_M = 0.05
 DRIFT_MPS = 0.12  # error of the odometry's velocity, constant over the window, one axis
+WORST_CHI2 = 3.0  # of the fit, for each degree of freedom
 LENGTH_SLACK = 0.35  # displacements that differ more are not of one motion
 CURRENT_NS = 3_000_000_000
+YAW_DRIFT_RADPS = math.radians(2.0) / 60  # heading drift of both odometries: autopilots and links, degrees per minute
+
+
+@dataclass(frozen=True)
+class OdomYaw:
+    """Yaw of frame `odom` in `map` when it was measured, R_map_odom = Rz(yaw), one sigma."""
+
+    stamp_ns: int
+    yaw_rad: float
+    sigma_rad: float
+
+    def sigma_at(self, stamp_ns: int) -> float:
+        """Sigma at a later time [rad], with the drift since."""
+        return math.hypot(self.sigma_rad, YAW_DRIFT_RADPS * (stamp_ns - self.stamp_ns) * 1e-9)
+
+    def agrees(self, other: OdomYaw) -> bool:
+        """Whether a later measurement agrees."""
+        sigma = math.hypot(self.sigma_at(other.stamp_ns), other.sigma_rad)
+        return abs(math.remainder(other.yaw_rad - self.yaw_rad, 2 * math.pi)) < 4.0 * sigma
 
 
 @dataclass(frozen=True)
@@ -55,10 +75,19 @@ class OdometryHeading:
         self._compass_sigma_rad, self._outliers = compass_sigma_rad, compass_outliers
         self._points: deque[tuple[int, Array64, float, Array64]] = deque()
         self._segment: int | None = None
+        self._fit: OdomYaw | None = None  # of the present window
+        self.odom_yaw: OdomYaw | None = None  # the most certain so far; it stays when the autopilot's odometry ends
+        self.confirmed = False  # whether the object that is followed has moved as the odometry
 
     def restart(self) -> None:
-        """Drop all points."""
+        """Drop everything: another frame `map` or `odom`, or another object."""
         self._points.clear()
+        self._fit, self.odom_yaw, self.confirmed = None, None, False
+
+    def on_found(self) -> None:
+        """An object is found that may be another drone: its motion has to confirm the yaw again."""
+        self._points.clear()
+        self._fit, self.confirmed = None, False
 
     def add(self, stamp_ns: int, xyz_map_m: Array64, variance_m2: float, xyz_odom_m: Array64, segment: int) -> None:
         """A LiDAR position (map) and the autopilot's position then; variance of one horizontal axis."""
@@ -71,19 +100,31 @@ class OdometryHeading:
         points.append((stamp_ns, xyz_map_m[:2], variance_m2, xyz_odom_m[:2]))
         while points[0][0] < stamp_ns - WINDOW_NS:
             points.popleft()
+        self._fit = self._measured(stamp_ns)
+        if self._fit is not None:
+            self._keep(self._fit)
+
+    def _keep(self, new: OdomYaw) -> None:
+        kept = self.odom_yaw
+        if kept is not None and not kept.agrees(new):
+            self.restart()
+            return
+        self.confirmed = True
+        if kept is None or new.sigma_rad <= kept.sigma_at(new.stamp_ns):
+            self.odom_yaw = new
 
     def evidence(self, stamp_ns: int, R_odom_drone: Array64) -> YawEvidence | None:
         """Yaw of the body at a time with the autopilot's attitude then; None: the motion does not show it."""
-        yaw = self._odom_yaw(stamp_ns)
-        if yaw is None:
+        fit = self._fit
+        if fit is None or not self._points or stamp_ns - fit.stamp_ns > CURRENT_NS:
             return None
-        sigma = math.hypot(yaw[1], self._compass_sigma_rad)
-        return YawEvidence(yaw[0] + heading_rad(R_odom_drone), sigma, self._outliers)
+        sigma = math.hypot(fit.sigma_rad, self._compass_sigma_rad)
+        return YawEvidence(fit.yaw_rad + heading_rad(R_odom_drone), sigma, self._outliers)
 
-    def _odom_yaw(self, stamp_ns: int) -> tuple[float, float] | None:
-        """Yaw of `odom` in `map` and its sigma."""
+    def _measured(self, stamp_ns: int) -> OdomYaw | None:
+        """Yaw of `odom` in `map` by the displacements of the window; None: they do not show it."""
         points = self._points
-        if len(points) < LEAST_POINTS or stamp_ns - points[-1][0] > CURRENT_NS:
+        if len(points) < LEAST_POINTS:
             return None
         t = np.array([p[0] - points[0][0] for p in points]) * 1e-9
         z, x = np.array([p[1] for p in points]), np.array([p[3] for p in points])
@@ -95,7 +136,10 @@ class OdometryHeading:
         precision = float((x * Wx).sum())
         if precision * LEAST_M**2 < 1.0 or float(np.ptp(x, axis=0).max()) < LEAST_M:
             return None
-        a = complex(float((Wx * z).sum()), float((Wx[:, 0] * z[:, 1] - Wx[:, 1] * z[:, 0]).sum())) / precision
-        if abs(abs(a) - 1.0) > LENGTH_SLACK:
+        z_level, x_level = z[:, 0] + 1j * z[:, 1], x[:, 0] + 1j * x[:, 1]
+        a = complex(np.vdot(W @ x_level, z_level)) / precision
+        left = z_level - z_level.mean() - a * (x_level - x_level.mean())
+        chi2 = float(np.vdot(left, W @ left).real)
+        if abs(abs(a) - 1.0) > LENGTH_SLACK or chi2 > WORST_CHI2 * 2 * (len(points) - 2):
             return None
-        return math.atan2(a.imag, a.real), 1.0 / math.sqrt(precision)
+        return OdomYaw(stamp_ns, math.atan2(a.imag, a.real), 1.0 / math.sqrt(precision))

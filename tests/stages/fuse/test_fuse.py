@@ -1,4 +1,4 @@
-"""The stage InertialFuse over short flights: decisions, states, absence, faults."""
+"""The stage Fuse over short flights: decisions, states, absence, faults."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import math
 import numpy as np
 import pytest
 
-from stages.fuse import InertialFuse
+from stages.fuse import Fuse
 from stages.messages import DroneMotion, PoseEstimate, PoseState, PositionEstimate, TrackState
-from tests.stages.fuse.inertial.imu_flights import ImuFlight, seconds
-from tests.stages.fuse.inertial.judged import CHI2_95, fly, rms
+from tests.stages.fuse.imu_flights import ImuFlight, seconds
+from tests.stages.fuse.judged import CHI2_95, fly, rms
 
 
 def test_manoeuvres_decide_the_heading_by_imu_alone():
@@ -64,7 +64,7 @@ def test_without_imu_cameras_give_the_rotation():
 
 def test_without_the_vehicle_s_motion_the_imu_is_not_used():
     flight = ImuFlight(kind="manoeuvre", seed=3, until_s=8.0)
-    stage, poses = InertialFuse(), []
+    stage, poses = Fuse(), []
     for _, port, message in flight.events():
         if port != "motion":
             poses += [m for m in getattr(stage, f"on_{port}")(message) if hasattr(m, "state")]
@@ -83,24 +83,18 @@ def test_a_gap_without_lidar_positions_is_propagated_with_a_growing_sigma_until_
 
 
 def test_a_drone_that_is_found_again_far_away_needs_evidence_for_its_heading():
-    flight = ImuFlight(kind="hover", seed=6, until_s=12.0, wind_mps=0.0)
-    stage = InertialFuse()
+    stage = Fuse()
     memory = ImuFlight(kind="fast", seed=6, until_s=10.0)
     for _, port, message in memory.events():
         list(getattr(stage, f"on_{port}")(message))
     estimator = stage._estimator
     assert estimator.decided
+    at_ns, last_m = estimator.stamp_ns, estimator.graph.state.xyz_m[0]
     estimator.lose()
-    assert estimator._memory is not None
-    remembered = estimator._remembered(
-        estimator._memory[0] + 10, np.array([500.0, 0, 0]), estimator.fix_covariance(_fix(flight), np.eye(3))
-    )
-    assert remembered is not None
-    assert remembered[2] < 0.999
-
-
-def _fix(flight: ImuFlight):
-    return next(message for _, port, message in flight.events() if port == "fix")
+    near, far = (estimator._memory.yaw(at_ns + 10, xyz_m, 0.01 * np.eye(3)) for xyz_m in (last_m, last_m + 500.0))
+    assert near is not None
+    assert far is not None
+    assert near[2] > 0.999 > far[2]
 
 
 def test_false_lidar_positions_do_not_move_the_pose():
@@ -113,7 +107,7 @@ def test_false_lidar_positions_do_not_move_the_pose():
 def test_lidar_positions_of_another_object_end_in_a_state_that_sends_nothing():
     """What the LiDAR follows does not move as the IMU measures: another drone."""
     own, other = ImuFlight(kind="fast", seed=7, until_s=20.0), ImuFlight(kind="fast", seed=8, until_s=20.0)
-    stage, states = InertialFuse(), {}
+    stage, states = Fuse(), {}
     theirs = [e for e in other.events() if e[1] == "fix" and seconds(e[2].stamp_ns) >= 8.0]
     ours = [e for e in own.events() if e[1] != "fix" or seconds(e[2].stamp_ns) < 8.0]
     for _, port, message in sorted(ours + theirs, key=lambda e: e[0]):
@@ -138,7 +132,7 @@ def test_the_time_of_the_measured_rotation_stands_still_in_a_gap_of_the_lidar():
 
 def test_an_object_that_is_not_the_drone_stays_lost_when_the_imu_ends():
     own, other = ImuFlight(kind="fast", seed=7, until_s=18.0), ImuFlight(kind="fast", seed=8, until_s=18.0)
-    stage, states = InertialFuse(), {}
+    stage, states = Fuse(), {}
     theirs = [e for e in other.events() if e[1] == "fix" and seconds(e[2].stamp_ns) >= 8.0]
     ours = [e for e in own.events() if e[1] != "fix" or seconds(e[2].stamp_ns) < 8.0]
     for _, port, message in sorted(ours + theirs, key=lambda e: e[0]):
@@ -151,7 +145,7 @@ def test_an_object_that_is_not_the_drone_stays_lost_when_the_imu_ends():
 
 
 def test_messages_that_are_not_finite_are_rejected_and_counted():
-    stage = InertialFuse()
+    stage = Fuse()
     for _, port, message in ImuFlight(kind="fast", seed=2, until_s=2.0).events():
         if isinstance(message, DroneMotion):
             bad = np.array([np.nan, 0.0, 0.0])
@@ -166,7 +160,7 @@ def _replaced(message, **values):
 
 @pytest.mark.parametrize("gap_s", [0.4, 3.0])
 def test_a_gap_in_the_imu_ends_in_a_correct_pose(gap_s):
-    stage, poses = InertialFuse(), []
+    stage, poses = Fuse(), []
     flight = ImuFlight(kind="fast", seed=2, until_s=22.0)
     for _, port, message in flight.events():
         if isinstance(message, DroneMotion) and 10.0 <= seconds(message.stamp_ns) < 10.0 + gap_s:
@@ -185,7 +179,7 @@ def test_two_runs_are_equal():
     events = ImuFlight(kind="fast", seed=2, until_s=6.0, rotations=True, images=True).events()
 
     def run():
-        stage = InertialFuse()
+        stage = Fuse()
         return [m for _, port, message in events for m in getattr(stage, f"on_{port}")(message) if hasattr(m, "state")]
 
     a, b = run(), run()
@@ -193,7 +187,7 @@ def test_two_runs_are_equal():
 
 
 def test_no_track_means_lost():
-    stage = InertialFuse()
+    stage = Fuse()
     made = []
     for _, port, message in ImuFlight(kind="hover", until_s=1.0).events():
         if port != "fix" and not isinstance(message, TrackState):

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from stages.fuse import InertialFuse
+from stages.fuse import Fuse
 from stages.kernels.geometry.so3 import log_rotation
 from stages.messages import HeadingEstimate, PoseEstimate, RelativePose
-from tests.stages.fuse.inertial.imu_flights import ImuFlight, seconds
+from tests.stages.fuse.imu_flights import ImuFlight, seconds
 
 CHI2_95 = 7.815  # 3 degrees of freedom
 DECIDED_WRONG_DEG = 20.0
@@ -40,9 +40,9 @@ class Flown:
     headings: list[HeadingEstimate] = field(default_factory=list)
 
 
-def fly(flight: ImuFlight, stage: InertialFuse | None = None) -> Flown:
+def fly(flight: ImuFlight, stage: Fuse | None = None) -> Flown:
     """Run a flight through the stage."""
-    stage, out = stage or InertialFuse(), Flown()
+    stage, out = stage or Fuse(), Flown()
     began = time.thread_time()
     events = flight.events()
     began = time.thread_time()

@@ -26,14 +26,30 @@ from stages.messages import (
     VehicleMotion,
     VisualMotion,
 )
-from tests.stages.fuse.made_drone_flight import START_NS, S, gauss_markov, ns
 
+S = 1_000_000_000
+START_NS = 1_700_000_000 * S
 FINE_S = 0.005
 G = 9.80665
 LIFT = np.array([0.0, 0.0, G])
 DRAG = 0.25  # [1/s] of the velocity through the air
 FIRST_FIX_S = 0.4
 KINDS = ("hover", "orbit", "square", "manoeuvre", "fast")
+
+
+def ns(t) -> int:
+    return START_NS + round(float(t) * S)
+
+
+def gauss_markov(rng, sigma, time_s, step_s, count, width=3):
+    """(count, width), stationary, one row each step."""
+    rho = math.exp(-step_s / time_s) if time_s > 0 else 0.0
+    white = rng.standard_normal((count, width)) * sigma
+    out = np.empty((count, width))
+    out[0] = white[0]
+    for i in range(1, count):
+        out[i] = rho * out[i - 1] + math.sqrt(1 - rho**2) * white[i]
+    return out
 
 
 @dataclass

@@ -1,6 +1,6 @@
 """Flights by IMU over seeds: when the heading is decided, errors and their consistency, gaps, CPU time.
 
-python -m pytest -m slow -n 0 tests/stages/fuse/inertial/test_inertial_flights.py -s     tables, about 15 min
+python -m pytest -m slow -n 0 tests/stages/fuse/test_fuse_flights.py -s     tables, about 15 min
 SEEDS=50 before it                                                                      more flights a line
 """
 
@@ -12,8 +12,8 @@ import os
 import numpy as np
 import pytest
 
-from tests.stages.fuse.inertial.imu_flights import ImuFlight
-from tests.stages.fuse.inertial.judged import HEADER, fly, rms, row
+from tests.stages.fuse.imu_flights import ImuFlight
+from tests.stages.fuse.judged import HEADER, fly, rms, row
 
 SEEDS = int(os.environ.get("SEEDS", "10"))
 VARIANTS = {

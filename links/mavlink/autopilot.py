@@ -31,6 +31,7 @@ from links.mavlink.poses.pose_sender import PoseMessage, PoseSender
 from links.mavlink.poses.sent_state import SentState
 from links.mavlink.profiles import PROFILES, ProfileName, RequiredParameter, YawOutput, required_parameters
 from links.mavlink.readers import AutopilotMessage
+from links.mavlink.source_switch import FIRST_SET, SourceSwitch
 from links.mavlink.streams.message_intervals import MessageIntervals, MessageRates
 from links.mavlink.transport.connection import Connection, Udp, parse_connection
 from links.mavlink.transport.signing import Signer
@@ -55,6 +56,7 @@ class AutopilotSettings(SourceSettings):
     send: tuple[PoseMessage, ...] = ("odometry",)  # messages per pose
     yaw: YawOutput = "none"  # none: positions in the autopilot's axes; measured: poses in `map`, EK3_SRCn_YAW 6
     source_set: int = Field(2, ge=1, le=3)  # ArduPilot: EK3_SRCn_* that are grd's; set 1 flies without it
+    switch_source: bool = False  # ArduPilot: request that set in flight, and set 1 when poses end (`source_switch.py`)
     on_rejection: OnRejection = "stop"  # when the autopilot's EKF rejects the pose: stop, reset or report
     limits: PoseLimits = PoseLimits()
     own_system_id: int | None = Field(None, ge=1, le=255)  # None: the autopilot's, as a component of its vehicle
@@ -91,6 +93,8 @@ class AutopilotSettings(SourceSettings):
             reason = PROFILES[self.profile].unsupported.get(kind)
             if reason:
                 raise ValueError(f"send: {kind} is not supported by profile {self.profile}: {reason}")
+        if self.switch_source and (self.profile != "ardupilot" or self.source_set == FIRST_SET):
+            raise ValueError("switch_source: needs profile ardupilot and source_set 2 or 3: set 1 flies without grd")
         if self.own_id == (self.system_id, self.component_id):
             raise ValueError("own_component_id: must differ from the autopilot's component_id")
         if self.connection is not None and self.connection.startswith("udpin:"):
@@ -182,6 +186,13 @@ class Autopilot(Source[AutopilotSettings]):
             self._poses,
             OriginSender(settings.global_origin, target),
             MessageIntervals(settings.message_rates, settings.profile, target, settings.own_id),
+            SourceSwitch(
+                settings.source_set if settings.switch_source else None,
+                settings.required_parameters,
+                target,
+                settings.own_id,
+                self._poses.texts.warn,
+            ),
             self._signer,
             now_ns,
             (settings.topic, SENT_TOPIC),

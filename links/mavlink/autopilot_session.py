@@ -33,6 +33,7 @@ from links.mavlink.poses.gate import RejectReason
 from links.mavlink.poses.independence import POSES, Independence
 from links.mavlink.poses.pose_sender import PoseSender
 from links.mavlink.poses.sent_state import SentState
+from links.mavlink.source_switch import SourceSwitch
 from links.mavlink.streams.message_intervals import MessageIntervals
 from links.mavlink.timesync_monitor import REQUEST_NS, TimesyncMonitor
 from links.mavlink.transport.connection import Connection
@@ -65,6 +66,7 @@ class AutopilotSession:
         poses: PoseSender,
         origin: OriginSender,
         intervals: MessageIntervals,
+        switch: SourceSwitch,
         signer: Signer | None,
         now_ns: Callable[[], int],
         topics: tuple[str, str],
@@ -76,6 +78,7 @@ class AutopilotSession:
         """`threaded` False: nothing runs by itself; the caller gives received bytes to `receive` and calls `tick`."""
         self.counts: Counter[str] = Counter()
         self.connection, self.poses, self.origin, self.intervals = connection, poses, origin, intervals
+        self.switch = switch
         self._target, self._own = target, own
         self._signer, self._now_ns = signer, now_ns
         self._received_topic, self._sent_topic = topics
@@ -135,6 +138,8 @@ class AutopilotSession:
             sent = [message for message in messages if self._send(message)]
             if sent:
                 self.poses.on_sent(pose, now_ns, sent)
+                if any(message.get_type() in POSES for message in sent):
+                    self.switch.on_sent(pose, self.poses.attitude.newest, now_ns)
             self._send_texts(now_ns)
 
     def sent(self) -> list[Record]:
@@ -154,6 +159,10 @@ class AutopilotSession:
                 counts["pose rejected by the autopilot"] = self.poses.fusion.rejections
             if self.origin.sent_times:
                 counts["origin sent"] = self.origin.sent_times
+            if self.switch.requests:
+                counts["source sets requested"] = self.switch.requests
+            if self.switch.agreement.disagreements:
+                counts["pose and autopilot differ"] = self.switch.agreement.disagreements
             round_trip_ns = self._timesync.newest_ns
             intervals = self.intervals.counters
         return {
@@ -189,6 +198,7 @@ class AutopilotSession:
             or signing
             or self._sent_state.status
             or self.intervals.status
+            or self.switch.status
         )
 
     def _silence(self) -> str | None:
@@ -237,6 +247,7 @@ class AutopilotSession:
                 if message.get_type() == "ATTITUDE":
                     self._on_attitude(message, arrival_ns)
                 self.intervals.on_message(message, arrival_ns)
+                self.switch.on_message(message, arrival_ns)
                 if message.get_type() == "TIMESYNC":
                     if message.tc1 == 0:
                         self._send(dialect().MAVLink_timesync_message(self._now_ns(), message.ts1))
@@ -250,6 +261,7 @@ class AutopilotSession:
         if event is AttitudeEvent.BOOTED:
             self.poses.on_boot()
             self.origin.restart()
+            self.switch.on_boot()
         elif event is AttitudeEvent.YAW_RESET:
             self.poses.on_yaw_reset()
         if self.poses.attitude.newest is not None:
@@ -311,6 +323,9 @@ class AutopilotSession:
                 request = self.intervals.due(now_ns)
                 if request is not None and not self._send(request):
                     self.intervals.on_not_sent()
+                request = self.switch.due(now_ns)
+                if request is not None and not self._send(request):
+                    self.switch.on_not_sent()
             self._send_texts(now_ns)
 
     def _send_texts(self, now_ns: int) -> None:

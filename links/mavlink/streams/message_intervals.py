@@ -27,12 +27,18 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from links.mavlink.commands import (
+    ACCEPTED,
+    DENIED,
+    IN_PROGRESS,
+    REPLY_NS,
+    TEMPORARILY_REJECTED,
+    command_long,
+    is_answer,
+)
 from links.mavlink.profiles import ProfileName
-from links.mavlink.transport.framing import dialect
 
 SET_MESSAGE_INTERVAL = 511  # MAV_CMD
-ACCEPTED, TEMPORARILY_REJECTED, DENIED, IN_PROGRESS = 0, 1, 2, 5  # MAV_RESULT; the others: not supported, failed
-REPLY_NS = 1_000_000_000  # a request without acknowledgement is repeated after this time
 RETRY_NS = 10_000_000_000  # between requests for a message that is given up, or whose rate fell
 WINDOW_NS = 2_000_000_000  # in which a rate is measured
 NEEDED_IMU_HZ = 10.0  # heading and preintegration work from this rate on
@@ -145,8 +151,7 @@ class MessageIntervals:
         stream = min(waiting, key=lambda stream: stream.next_ns)
         self._pending = stream, now_ns
         self._rates.setdefault(stream.name, _Rate(now_ns))
-        values = float(NAMES[stream.name]), 1e6 / stream.rate_hz, 0.0, 0.0, 0.0, 0.0, 0.0
-        return dialect().MAVLink_command_long_message(*self._target, SET_MESSAGE_INTERVAL, 0, *values)
+        return command_long(self._target, SET_MESSAGE_INTERVAL, float(NAMES[stream.name]), 1e6 / stream.rate_hz)
 
     def on_not_sent(self) -> None:
         """The request of `due` could not be sent."""
@@ -162,13 +167,8 @@ class MessageIntervals:
             self._boot_ms = boot_ms
         if kind in NAMES:
             self._rates.setdefault(kind, _Rate(now_ns)).count += 1
-        elif kind == "COMMAND_ACK" and message.command == SET_MESSAGE_INTERVAL and self._is_ours(message):
+        elif is_answer(message, SET_MESSAGE_INTERVAL, self._own):
             self._on_result(message.result, now_ns)
-
-    def _is_ours(self, ack: Any) -> bool:
-        """Whether an acknowledgement is for us; older autopilots do not name the requester."""
-        named = getattr(ack, "target_system", 0), getattr(ack, "target_component", 0)
-        return all(name in (0, own) for name, own in zip(named, self._own, strict=True))
 
     def _on_result(self, result: int, now_ns: int) -> None:
         if self._pending is None or result == IN_PROGRESS:

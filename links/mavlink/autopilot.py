@@ -36,7 +36,7 @@ from links.mavlink.streams.message_intervals import MessageIntervals, MessageRat
 from links.mavlink.transport.connection import Connection, Udp, parse_connection
 from links.mavlink.transport.signing import Signer
 from links.mavlink.transport.stream_connection import open_connection
-from stages.messages import RelativePose
+from stages.messages import EarlierOdomFrame, RelativePose
 
 VISUAL_INERTIAL_ODOMETRY = 197  # MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY: our component id
 SENT_TOPIC = "/autopilot/tx"
@@ -121,7 +121,7 @@ class Autopilot(Source[AutopilotSettings]):
         self._poses: PoseSender | None = None
         self._not_connected: int = 0
 
-    def decode(self, record: Record) -> AutopilotMessage | None:
+    def decode(self, record: Record) -> AutopilotMessage | EarlierOdomFrame | None:
         """The message of one frame; None for an unused or rejected frame (see `counters`), and for a sent one."""
         if record.topic == SENT_TOPIC:
             self._decoder.sent(record)

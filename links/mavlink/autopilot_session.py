@@ -31,6 +31,7 @@ from links.mavlink.origin import OriginSender
 from links.mavlink.poses.attitude_monitor import AttitudeEvent
 from links.mavlink.poses.gate import RejectReason
 from links.mavlink.poses.independence import POSES, Independence
+from links.mavlink.poses.odom_frame import OwnPosition, odom_frame
 from links.mavlink.poses.pose_sender import PoseSender
 from links.mavlink.poses.sent_state import SentState
 from links.mavlink.source_switch import SourceSwitch
@@ -88,10 +89,13 @@ class AutopilotSession:
         self._split_connection = 0  # `reconnects` of the splitter's bytes
         self._mav = dialect().MAVLink(None, srcSystem=own[0], srcComponent=own[1])
         self._sent: deque[Record] = deque(maxlen=SENT_RECORDS)
+        self._own_position: OwnPosition | None = None
+        self._earlier_odom: tuple[int, bytes] | None = None  # of an earlier run, until it is a record
         if self._sent_state.earlier is not None:
-            earlier_ns, pose = self._sent_state.earlier
+            earlier_ns, pose, odom = self._sent_state.earlier
             independence.on_sent(EARLIER_POSE, earlier_ns)
             self._sent.append(Record(self._sent_topic, now_ns(), earlier_ns, pose))
+            self._earlier_odom = None if odom is None else (earlier_ns, odom)
         self._lock = threading.Lock()  # for numbering, signing and sending
         self._closed = threading.Event()
         self._heartbeat_ns = self._request_ns = 0
@@ -119,7 +123,10 @@ class AutopilotSession:
             yield from self.receive(*received, self._now_ns())
 
     def receive(self, data: bytes, source: tuple[str, int], arrival_ns: int) -> Iterator[Record]:
-        """Records of received bytes; answers to them are sent at once."""
+        """Records of received bytes, after the state of an earlier run; answers to them are sent at once."""
+        if self._earlier_odom is not None:
+            (earlier_ns, odom), self._earlier_odom = self._earlier_odom, None
+            yield Record(self._received_topic, arrival_ns, earlier_ns, odom)
         if self._split_connection != self.connection.reconnects:
             self._splitter.reset()
             self._split_connection = self.connection.reconnects
@@ -135,11 +142,11 @@ class AutopilotSession:
             now_ns = self._now_ns()
             self._send_periodic(now_ns)
             messages = self.poses.messages(pose, now_ns, self._link_reason(now_ns))
-            sent = [message for message in messages if self._send(message)]
+            sent = [message for message in messages if self._send(message, pose)]
             if sent:
                 self.poses.on_sent(pose, now_ns, sent)
                 if any(message.get_type() in POSES for message in sent):
-                    self.switch.on_sent(pose, self.poses.attitude.newest, now_ns)
+                    self.switch.on_sent(pose, self.poses.attitude.newest, self._own_position, now_ns)
             self._send_texts(now_ns)
 
     def sent(self) -> list[Record]:
@@ -246,6 +253,8 @@ class AutopilotSession:
                 self.poses.on_estimator_status(message, arrival_ns)
                 if message.get_type() == "ATTITUDE":
                     self._on_attitude(message, arrival_ns)
+                elif message.get_type() == "LOCAL_POSITION_NED":
+                    self._own_position = OwnPosition.of(message, arrival_ns)
                 self.intervals.on_message(message, arrival_ns)
                 self.switch.on_message(message, arrival_ns)
                 if message.get_type() == "TIMESYNC":
@@ -291,7 +300,6 @@ class AutopilotSession:
     def _run(self) -> None:
         while not self._closed.wait(WAKE_S):
             self.tick()
-            self._sent_state.write()
             if self._signer is not None:
                 self._signer.write_timestamp()
 
@@ -327,6 +335,7 @@ class AutopilotSession:
                 if request is not None and not self._send(request):
                     self.switch.on_not_sent()
             self._send_texts(now_ns)
+        self._sent_state.write()
 
     def _send_texts(self, now_ns: int) -> None:
         """Send the text that is due. The lock is held."""
@@ -334,8 +343,8 @@ class AutopilotSession:
             if not self._send(message):
                 self.poses.texts.on_not_sent()
 
-    def _send(self, message: Any) -> bool:
-        """Pack, sign and send one message. The lock is held."""
+    def _send(self, message: Any, pose: RelativePose | None = None) -> bool:
+        """Pack, sign and send one message, of a pose if it is one. The lock is held."""
         now_ns = self._now_ns()
         if self._signer is not None:
             self._signer.sign_for(self._mav, now_ns)
@@ -346,7 +355,8 @@ class AutopilotSession:
             return False
         self.counts[f"sent: {kind}"] += 1
         self._independence.on_sent(kind, now_ns)
-        if kind in POSES:
-            self._sent_state.on_sent(frame, now_ns)
+        if kind in POSES and pose is not None:
+            own = self.poses.attitude.newest, self._own_position
+            self._sent_state.on_sent(frame, now_ns, lambda: odom_frame(pose, *own, self._own))
         self._sent.append(Record(self._sent_topic, now_ns, now_ns, frame))
         return True

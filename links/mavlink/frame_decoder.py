@@ -18,10 +18,11 @@ from typing import Any
 from flow.link import Record
 from links.clock.device_clock import DeviceClock
 from links.mavlink.poses.independence import Independence
+from links.mavlink.poses.odom_frame import read_odom_frame
 from links.mavlink.readers import READERS, TIMELESS_READERS, AutopilotMessage
 from links.mavlink.streams.imu_stamps import DELAY_NS, ImuSelection, time_since_boot_us
 from links.mavlink.transport.framing import SEQUENCE, header, known, parse_frame, timesync_target
-from stages.messages import AutopilotStatus, DroneAttitude, DroneLocalPosition, DroneOdometry
+from stages.messages import AutopilotStatus, DroneAttitude, DroneLocalPosition, DroneOdometry, EarlierOdomFrame
 
 HALF_MS_NS = 500_000  # time_boot_ms is truncated, on average half a millisecond early
 ARMED = 128  # MAV_MODE_FLAG_SAFETY_ARMED
@@ -46,13 +47,15 @@ class FrameDecoder:
         self._imu = ImuSelection()
         self._matched = False  # replies to our TIMESYNC are recorded with the request's time as stamp
 
-    def decode(self, record: Record) -> AutopilotMessage | None:
+    def decode(self, record: Record) -> AutopilotMessage | EarlierOdomFrame | None:
         """The message of one frame; None for an unused or rejected frame (see `rejected`)."""
         try:
             frame = parse_frame(record.data)
         except ValueError:
             return self._refuse("damaged")
         sender, number = header(record.data)
+        if sender == self._own:
+            return self._earlier_run(frame, record.stamp_ns)
         if sender != self._sender:
             return self._refuse("from another system")
         kind = frame.get_type()
@@ -89,6 +92,13 @@ class FrameDecoder:
         self._last_ns[kind] = stamp_ns
         self.decoded += 1
         return message
+
+    def _earlier_run(self, frame: Any, stamp_ns: int) -> EarlierOdomFrame | None:
+        """State of an earlier run, which the session reports as a received frame of our own."""
+        try:
+            return read_odom_frame(frame, stamp_ns)
+        except (AttributeError, ValueError):
+            return self._refuse("echo of our own")
 
     def _stamp(self, frame: Any, arrival_ns: int) -> int | None:
         """Time of the measurement on the host's timeline; None while the device's clock is inconsistent."""

@@ -26,9 +26,18 @@ from stages.geometry.se3 import mahalanobis2, position_covariance
 from stages.heading.motion_yaw import MAX_ALTERNATIVE_ODDS, Point
 from stages.heading.odometry_yaw import OdometryYaw
 from stages.heading.yaw_fit import Yaw, apart_rad
-from stages.messages import DroneAttitude, DroneFix, DroneLocalPosition, DroneOdometry, VehicleMotion, VisualMotion
+from stages.messages import (
+    DroneAttitude,
+    DroneFix,
+    DroneLocalPosition,
+    DroneOdometry,
+    HeadingPrior,
+    VehicleMotion,
+    VisualMotion,
+)
 
 LEAST_MPS = 0.5  # minimum speed for a direction of flight by the camera
+PRIOR_NS, PRIOR_FIXES = 150_000_000, 5  # largest age of a prior, and LiDAR positions in a row that agree with it
 BRANCH_RAD, BRANCHES = math.radians(30.0), 3  # consecutive rotations this far off are another branch
 
 
@@ -47,6 +56,8 @@ class Estimator:
         self.resets, self.track_id = 0, 0
         self.unverified = False  # the new track may be of another object than the one before
         self._was_still = False
+        self._prior: HeadingPrior | None = None
+        self._agreed = 0  # consecutive LiDAR positions at the position of the prior
         self.newest_fix_ns: int | None = None  # also when the drone is lost
         self.unconfirmed_ns: int | None = None  # newest rotation by vanishing points that no motion has confirmed
         self.lose()
@@ -80,6 +91,21 @@ class Estimator:
     def add_autopilot(self, telemetry: DroneAttitude | DroneLocalPosition | DroneOdometry) -> None:
         """Add telemetry of the autopilot."""
         self.odometry_yaw.add(self.motions.motion_model.autopilot, telemetry)
+
+    def add_prior(self, prior: HeadingPrior) -> None:
+        """Add the yaw of frame odom that an earlier run of grd knew."""
+        self._prior = prior
+
+    def _use_prior(self, stamp_ns: int, z: Array64, noise: MeasurementCovariance) -> None:
+        """Take it when no yaw is known and PRIOR_FIXES LiDAR positions in a row are where the autopilot is by it."""
+        prior = self._prior
+        if self.odometry_yaw.yaw is not None or prior is None or abs(stamp_ns - prior.stamp_ns) > PRIOR_NS:
+            self._agreed = 0
+            return
+        covariance_m2 = noise.whole_m2 + prior.position_sigma_m**2 * np.eye(3)
+        self._agreed = self._agreed + 1 if mahalanobis2(z - prior.xyz_map_m, covariance_m2) <= GATE else 0
+        if self._agreed >= PRIOR_FIXES:
+            self.odometry_yaw.yaw = Yaw(stamp_ns, prior.yaw_map_odom_rad, prior.sigma_rad**2)
 
     def add_visual_motion(self, motion: VisualMotion) -> None:
         """Add visual odometry of the drone: its turn, and its direction of flight where nothing better measures it."""
@@ -202,6 +228,7 @@ class Estimator:
         R_after = None if R is None else self.chain.at(stamp_ns)[0]  # what the fix corrects in rotation is not drift
         self.positions.follow(stamp_ns, z, factor, R_after)
         self._branch_check.add_fix(fix)
+        self._use_prior(stamp_ns, z, noise)
         self._add_motion_point(stamp_ns, z, noise.whole_m2)
 
     def _reinitialise(self, fix: DroneFix, z: Array64, noise: MeasurementCovariance) -> None:

@@ -20,6 +20,7 @@ from collections import Counter
 from collections.abc import Iterator
 from typing import Any, ClassVar
 
+import numpy as np
 from pydantic import Field
 
 from flow.counters import Counters
@@ -40,6 +41,7 @@ from stages.messages import (
     DroneFix,
     DroneLocalPosition,
     DroneOdometry,
+    HeadingPrior,
     PoseState,
     RelativePose,
     RelativeRotation,
@@ -69,7 +71,7 @@ class Fuse(Stage[FuseSettings]):
     """Pose of the drone by a fixed-lag smoother, with its state."""
 
     optional_inputs: ClassVar[frozenset[str]] = frozenset(
-        {"rotation", "motion", "position", "odometry", "attitude", "visual_motion", "track", "servo", "tick"}
+        {"rotation", "motion", "position", "odometry", "attitude", "visual_motion", "prior", "track", "servo", "tick"}
     )
 
     def __init__(self, settings: FuseSettings | None = None, /, **values: Any) -> None:
@@ -125,6 +127,13 @@ class Fuse(Stage[FuseSettings]):
         if self._intake.is_valid(position, "position", position.xyz_odom_m, position.velocity_odom_mps):
             self._estimator.add_autopilot(position)
         yield from self._publish(position)
+
+    def on_prior(self, prior: HeadingPrior) -> Poses:
+        """Yaw of frame odom that an earlier run of grd knew."""
+        numbers = np.array([prior.yaw_map_odom_rad, prior.sigma_rad, prior.position_sigma_m])
+        if self._intake.is_valid(prior, "heading prior", prior.xyz_map_m, numbers):
+            self._estimator.add_prior(prior)
+        yield from self._publish(prior)
 
     def on_visual_motion(self, motion: VisualMotion) -> Poses:
         """Visual odometry of the drone: turns, and directions without scale."""

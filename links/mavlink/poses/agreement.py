@@ -18,28 +18,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from links.mavlink.ned_frd import R_odom_drone_from_rpy, flip_yz
+from links.mavlink.poses.odom_frame import OwnPosition, odom_yaw_rad
 from links.mavlink.poses.position_messages import OwnAttitude
-from stages.geometry.frames import Array64, heading_rad, rotation_z
-from stages.messages import PoseEstimate, RelativePose
+from stages.geometry.frames import Array64, rotation_z
+from stages.messages import RelativePose
 
 OWN_SIGMA_M, POSE_SIGMA_M = 0.5, 0.35
 TOLERANCE_M = 3.0 * math.hypot(OWN_SIGMA_M, POSE_SIGMA_M)  # 1.8 m
 LEAST_M = 2.0 * TOLERANCE_M  # 30 deg of yaw are then 1.04 of the tolerance
 REFERENCE_NS = 20_000_000_000
-OWN_AGE_NS = 300_000_000  # of its position against the pose; it is extrapolated by its velocity
 HELD_NS = 60_000_000_000  # so long after the drone has moved they still count as agreeing
-
-
-@dataclass(frozen=True, slots=True)
-class _OwnPosition:
-    arrival_ns: int
-    xyz_odom_m: Array64
-    velocity_odom_mps: Array64
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +47,6 @@ class Agreement:
 
     def __init__(self) -> None:
         self.disagreements = 0
-        self._own: _OwnPosition | None = None
         self._reference: _Reference | None = None
         self._agreed_ns: int | None = None
 
@@ -64,21 +54,11 @@ class Agreement:
         """The autopilot has booted, or poses were not sent for a while."""
         self._reference = self._agreed_ns = None
 
-    def on_local_position(self, message: Any, arrival_ns: int) -> None:
-        """LOCAL_POSITION_NED; one that is not finite is ignored."""
-        values = np.array([message.x, message.y, message.z, message.vx, message.vy, message.vz])
-        if np.isfinite(values).all():
-            self._own = _OwnPosition(arrival_ns, flip_yz(values[:3]), flip_yz(values[3:]))
-
-    def add(self, pose: RelativePose, own: OwnAttitude | None) -> float | None:
-        """Add a pose that was sent; returns the distance [m] when it disagrees."""
-        position, yaw_rad = self._own, _odom_yaw_rad(pose, own)
-        if pose.xyz_map_m is None or yaw_rad is None or position is None:
+    def add(self, pose: RelativePose, own: OwnAttitude | None, position: OwnPosition | None) -> float | None:
+        """Add a pose that was sent, and the autopilot's newest estimate; returns the distance [m] when it disagrees."""
+        yaw_rad, xyz_odom_m = odom_yaw_rad(pose, own), None if position is None else position.at(pose.stamp_ns)
+        if pose.xyz_map_m is None or yaw_rad is None or xyz_odom_m is None:
             return None
-        since_ns = pose.stamp_ns - position.arrival_ns
-        if abs(since_ns) > OWN_AGE_NS:
-            return None
-        xyz_odom_m = position.xyz_odom_m + 1e-9 * since_ns * position.velocity_odom_mps
         first = self._reference
         if first is None or pose.resets != first.resets or pose.track_id != first.track_id:
             self._agreed_ns = None
@@ -104,13 +84,3 @@ class Agreement:
     def _start(self, pose: RelativePose, xyz_odom_m: Array64) -> None:
         assert pose.xyz_map_m is not None
         self._reference = _Reference(pose.stamp_ns, pose.xyz_map_m, xyz_odom_m, pose.track_id, pose.resets)
-
-
-def _odom_yaw_rad(pose: RelativePose, own: OwnAttitude | None) -> float | None:
-    """Yaw of the autopilot's axes in `map`; None: not known."""
-    if pose.odom_yaw_rad is not None:
-        return pose.odom_yaw_rad
-    if own is None or not isinstance(pose.estimate, PoseEstimate):
-        return None
-    R_odom_drone = R_odom_drone_from_rpy(own.roll_rad, own.pitch_rad, own.yaw_rad)
-    return heading_rad(pose.estimate.R_map_drone) - heading_rad(R_odom_drone)

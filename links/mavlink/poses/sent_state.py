@@ -4,6 +4,9 @@ The next session reports that pose once as a sent frame, with the time at which 
 with the autopilot's boot, live and in replay alike (`independence.py`): until the autopilot reboots, its estimate is
 not independent. Without a file every start is taken as the first one since the autopilot's boot.
 
+With the pose the autopilot's local frame in `map` is kept (`odom_frame.py`). The next session reports it as the first
+received frame, and a stage decides whether it still holds.
+
 Times are host times. If the wall clock of a host without a battery is set between two runs, they are wrong: see
 deploy/grd.service, which orders grd after time-sync.
 
@@ -14,6 +17,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 from links.mavlink.transport.framing import dialect
@@ -29,13 +33,16 @@ class SentState:
         """Why the file cannot be read or written."""
         self._file = file
         self._newest: tuple[int, bytes] | None = None
+        self._odom: bytes | None = None
         self._written_ns: int | None = None
         self.earlier = self._read(now_ns)
-        """Time and frame of the newest pose of earlier runs; None: none."""
+        """Time and frame of the newest pose of earlier runs, and frame odom in `map` then; None: none."""
 
-    def on_sent(self, frame: bytes, sent_ns: int) -> None:
-        """A pose was sent."""
+    def on_sent(self, frame: bytes, sent_ns: int, odom: Callable[[], bytes | None] = lambda: None) -> None:
+        """A pose was sent; `odom`: makes frame odom in `map`, called when it will be written."""
         self._newest = sent_ns, frame
+        if self._file is not None and (self._written_ns is None or sent_ns - self._written_ns >= WRITE_NS):
+            self._odom = odom()
 
     def write(self) -> None:
         """Write the newest pose, at most once a second. Until it succeeds it is repeated."""
@@ -47,25 +54,28 @@ class SentState:
         partial = self._file.with_suffix(".partial")
         try:
             self._file.parent.mkdir(parents=True, exist_ok=True)
-            partial.write_text(json.dumps({"sent_ns": newest[0], "frame": newest[1].hex()}), encoding="ascii")
+            fields = {"sent_ns": newest[0], "frame": newest[1].hex(), "odom": self._odom and self._odom.hex()}
+            partial.write_text(json.dumps(fields), encoding="ascii")
             os.replace(partial, self._file)
         except OSError as error:
             self.status = f"{self._file} cannot be written: {error.strerror}. A restart would not know of sent poses"
         else:
             self._written_ns, self.status = newest[0], None
 
-    def _read(self, now_ns: int) -> tuple[int, bytes] | None:
+    def _read(self, now_ns: int) -> tuple[int, bytes, bytes | None] | None:
         """A file that cannot be read counts as a pose sent now."""
         if self._file is None:
             return None
         try:
             fields = json.loads(self._file.read_text(encoding="ascii"))
-            return min(int(fields["sent_ns"]), now_ns), bytes.fromhex(fields["frame"])
+            odom = fields.get("odom")
+            sent_ns, frame = min(int(fields["sent_ns"]), now_ns), bytes.fromhex(fields["frame"])
+            return sent_ns, frame, None if odom is None else bytes.fromhex(odom)
         except FileNotFoundError:
             return None
         except (OSError, ValueError, TypeError, KeyError) as error:
             self.status = f"{self._file} cannot be read ({error!r}): delete it after a reboot of the autopilot"
-            return now_ns, _unknown_pose()
+            return now_ns, _unknown_pose(), None
 
 
 def _unknown_pose() -> bytes:

@@ -5,6 +5,10 @@ measured. The published state is propagated from the horizon by the IMU. A measu
 has passed its time is moved to the horizon.
 
 The heading of a lost drone is remembered and propagated by the gyroscope: it is one hypothesis when a drone is found.
+After a restart of grd in flight it is that of the earlier run (HeadingPrior). It holds if the autopilot's frame has not
+changed meanwhile. A LiDAR position at the distance d from the prior's decides, with the share s of changed frames:
+
+    P = (1 - s) N(d; S) / ((1 - s) N(d; S) + s / FRAME_AREA_M2)
 
 Source: ours; DESIGN, Fusion.
 """
@@ -31,13 +35,15 @@ from stages.heading.inertial_heading import InertialHeading, bias_free_turn, tur
 from stages.heading.inertial_state import POSITION, THETA, VELOCITY, InertialState, log_rotations
 from stages.heading.odometry_heading import OdometryHeading
 from stages.heading.ownership import Ownership, log_evidence
-from stages.messages import AutopilotMotion, DroneFix, DroneMotion, RelativeRotation, VisualMotion
+from stages.messages import AutopilotMotion, DroneFix, DroneMotion, HeadingPrior, RelativeRotation, VisualMotion
 
 DELAY_NS = 100_000_000  # measurements arrive at most this long after their stamp
 GATE = 16.27  # chi-square, 3 degrees of freedom, 99.9 %
 TILT_TIME_S = 20.0  # time constant of the error of roll and pitch
 KEPT_NS = 15_000_000_000  # without a LiDAR position the estimate ends; the heading is remembered
 MEMORY_NS = 120_000_000_000
+PRIOR_NS = 150_000_000  # between a prior and the LiDAR position with which it is used
+FRAME_AREA_M2 = math.pi * 10.0**2  # a position in a changed frame is somewhere within 10 m
 SAME_DRONE, MAYBE_ANOTHER = 0.9995, 0.9  # probability that a remembered heading holds
 VEHICLE_NS, WAIT_NS = 60_000_000, 350_000_000  # extrapolation of the vehicle's pose; longest wait for a newer one
 IMAGE_NS = 300_000_000  # without an IMU, longest wait for the drone's next image
@@ -76,6 +82,8 @@ class InertialEstimator:
         self.bias_covariance_m2 = np.zeros((3, 3))
         self.rotation_bias_rad2 = np.zeros((3, 3))
         self._memory: tuple[int, InertialState] | None = None
+        self._prior: HeadingPrior | None = None  # of an earlier run, until it was used or the heading was decided
+        self._prior_used = False
         self._restart_filters()
 
     def _restart_filters(self) -> None:
@@ -103,6 +111,10 @@ class InertialEstimator:
             self.imu.add_visual_motion(measurement)
         self._count += 1
         heapq.heappush(self._waiting, (measurement.stamp_ns, self._count, measurement))
+
+    def add_prior(self, prior: HeadingPrior) -> None:
+        """Add the heading of an earlier run; it is used once, at a LiDAR position, before the heading was decided."""
+        self._prior = None if self._prior_used else prior
 
     def pass_time(self, now_ns: int) -> None:
         """Move the horizon and use the measurements before it."""
@@ -233,8 +245,9 @@ class InertialEstimator:
         R_map_vehicle, t = self._vehicle.at(stamp_ns)
         z, covariance = R_map_vehicle @ fix.xyz_vehicle_m + t, self.fix_covariance(fix, R_map_vehicle)
         self.newest_fix_ns = max(stamp_ns, self.newest_fix_ns or stamp_ns)
-        if not self.known:
-            self._find(fix, z, covariance)
+        earlier = self._of_earlier_run(stamp_ns, z, covariance)
+        if not self.known or earlier is not None:
+            self._find(fix, z, covariance, earlier)
             return
         late_s = max(self.stamp_ns - stamp_ns, 0) * 1e-9
         if late_s > 0.5:
@@ -301,14 +314,16 @@ class InertialEstimator:
         if self.graph.running:
             self.heading.stop()
 
-    def _find(self, fix: DroneFix, z: Array64, covariance: FixCovariance) -> None:
-        """Start at a LiDAR position."""
+    def _find(
+        self, fix: DroneFix, z: Array64, covariance: FixCovariance, earlier: tuple[float, float, float] | None = None
+    ) -> None:
+        """Start at a LiDAR position; `earlier`: yaw of an earlier run, its sigma and the probability that it holds."""
         velocity = fix.velocity_vehicle_mps
         if velocity is not None:
             velocity = self._vehicle.to_map(fix.stamp_ns, fix.xyz_vehicle_m, velocity)[1]
         up = self._up_at(fix.stamp_ns)
         self._restart_filters()
-        memory = self._remembered(fix.stamp_ns, z, covariance)
+        memory = self._remembered(fix.stamp_ns, z, covariance) if earlier is None else earlier
         level = np.array([0.0, 0.0, 1.0]) if up is None else up
         self.heading.start(fix.stamp_ns, z, covariance.white + covariance.bias, velocity, level, memory)
         self.fix_ns, self.bias_covariance_m2 = fix.stamp_ns, covariance.bias
@@ -324,6 +339,22 @@ class InertialEstimator:
         noise = covariance.white + covariance.bias + state.covariance[0, POSITION, POSITION]
         same = mahalanobis2(z - state.xyz_m[0], noise) <= GATE and stamp_ns - self._memory[0] < KEPT_NS
         return float(state.yaw_rad[0]), sigma, SAME_DRONE if same else MAYBE_ANOTHER
+
+    def _of_earlier_run(
+        self, stamp_ns: int, z: Array64, covariance: FixCovariance
+    ) -> tuple[float, float, float] | None:
+        """Yaw of an earlier run, its sigma and the probability that it holds; None: none, or not needed any more."""
+        self._prior_used = self._prior_used or self.decided
+        prior = self._prior
+        if prior is None or self._prior_used or abs(stamp_ns - prior.stamp_ns) > PRIOR_NS:
+            return None
+        S = (covariance.white + covariance.bias)[:2, :2] + prior.position_sigma_m**2 * np.eye(2)
+        off_m = (z - prior.xyz_map_m)[:2]
+        density = math.exp(-0.5 * mahalanobis2(off_m, S)) / (2 * math.pi * math.sqrt(np.linalg.det(S)))
+        share = self._errors.changed_frames
+        kept = (1.0 - share) * density
+        self._prior_used = True
+        return prior.yaw_map_rad, prior.sigma_rad, kept / (kept + share / FRAME_AREA_M2)
 
     def _add_vertical(self, stamp_ns: int) -> None:
         """The autopilot's roll and pitch, each tilt_period_s."""

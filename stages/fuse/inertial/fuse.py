@@ -42,6 +42,7 @@ from stages.messages import (
     DroneFix,
     DroneMotion,
     HeadingEstimate,
+    HeadingPrior,
     PoseState,
     RelativePose,
     RelativeRotation,
@@ -71,7 +72,7 @@ class InertialFuse(Stage[InertialFuseSettings]):
     """Pose of the drone by IMU and LiDAR, with its state."""
 
     optional_inputs: ClassVar[frozenset[str]] = frozenset(
-        {"rotation", "motion", "drone_motion", "visual_motion", "track", "servo", "tick"}
+        {"rotation", "motion", "drone_motion", "visual_motion", "prior", "track", "servo", "tick"}
     )
 
     def __init__(self, settings: InertialFuseSettings | None = None, /, **values: Any) -> None:
@@ -111,6 +112,13 @@ class InertialFuse(Stage[InertialFuseSettings]):
         ):
             self._estimator.add_motion(motion)
         yield from self._publish(motion)
+
+    def on_prior(self, prior: HeadingPrior) -> Poses:
+        """Heading that an earlier run of grd knew."""
+        numbers = np.array([prior.yaw_map_rad, prior.sigma_rad, prior.position_sigma_m])
+        if self._intake.is_valid(prior, "heading prior", prior.xyz_map_m, numbers):
+            self._estimator.add_prior(prior)
+        yield from self._publish(prior)
 
     def on_visual_motion(self, motion: VisualMotion) -> Poses:
         """Visual odometry of the drone: turns, and directions without scale."""

@@ -14,7 +14,8 @@ from pydantic import ValidationError
 from pymavlink.dialects.v20 import ardupilotmega
 
 from links.mavlink import Autopilot, source_switch
-from links.mavlink.poses.agreement import LEAST_M
+from links.mavlink.poses.agreement import LEAST_M, Agreement
+from links.mavlink.poses.odom_frame import OwnPosition
 from links.mavlink.poses.position_messages import OwnAttitude
 from links.mavlink.profiles import required_parameters
 from links.mavlink.source_switch import SET_EKF_SOURCE_SET, SourceSwitch
@@ -48,6 +49,7 @@ class Flight:
         self.yaw_error_rad, self.compass_rad = 0.0, 0.0
         self.measured = True
         self.own_speed_mps = 1.0
+        self.own: OwnPosition | None = None
 
     def fly(self, seconds: float) -> Flight:
         for _ in range(round(50 * seconds)):
@@ -69,14 +71,15 @@ class Flight:
             give(mavlink.MAVLink_ekf_status_report_message(self.flags, 0.1, self.ratio, 0, 0, 0))
         if self.flags == POSITION:
             v = self.own_speed_mps
-            give(mavlink.MAVLink_local_position_ned_message(0, 50 + v * x_m, 7, -30, v, 0, 0))
+            message = mavlink.MAVLink_local_position_ned_message(0, 50 + v * x_m, 7, -30, v, 0, 0)
+            self.own, _ = OwnPosition.of(message, self.now_ns), give(message)
         if self.poses:
             pose = good_pose(
                 self.now_ns, xyz_map_m=np.array([x_m, 2.0, 10.0]), R_map_drone=rotation_z(self.yaw_error_rad)
             )
             measured_ns = self.now_ns if self.measured else self.now_ns - 2_000 * MS
             pose = dataclasses.replace(pose, odom_yaw_rad=None, measured_ns=measured_ns)
-            self.switch.on_sent(pose, OwnAttitude(0.0, 0.0, self.compass_rad, self.now_ns), self.now_ns)
+            self.switch.on_sent(pose, OwnAttitude(0.0, 0.0, self.compass_rad, self.now_ns), self.own, self.now_ns)
 
     def _answer(self, request: Any) -> None:
         if request.get_type() == "PARAM_REQUEST_READ":
@@ -137,15 +140,12 @@ def test_the_set_is_not_requested_while_a_condition_does_not_hold(changes: dict[
 
 
 def test_a_drone_that_hovers_gives_no_evidence_that_its_poses_are_right():
-    flight = Flight()
-    flight.own_speed_mps = 0.0
-    flight._receive = lambda: None  # type: ignore[method-assign]
-    switch, now_ns = flight.switch, HOST0
+    agreement, now_ns = Agreement(), HOST0
     for _ in range(1500):
         now_ns += 20 * MS
-        switch.on_message(mavlink.MAVLink_local_position_ned_message(0, 1, 2, 3, 0, 0, 0), now_ns)
-        switch.on_sent(good_pose(now_ns), OwnAttitude(0, 0, 0, now_ns), now_ns)
-    assert not switch.agreement.agrees(now_ns)
+        own = OwnPosition(now_ns, np.array([1.0, 2.0, 3.0]), np.zeros(3))
+        assert agreement.add(good_pose(now_ns), None, own) is None
+    assert not agreement.agrees(now_ns)
 
 
 def test_a_difference_is_reported_and_counted():

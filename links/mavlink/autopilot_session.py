@@ -28,10 +28,10 @@ from typing import Any
 
 from flow.link import LinkError, Record
 from links.mavlink.origin import OriginSender
-from links.mavlink.poses.attitude_monitor import AttitudeEvent
 from links.mavlink.poses.gate import RejectReason
 from links.mavlink.poses.independence import POSES, Independence
-from links.mavlink.poses.odom_frame import OwnPosition, odom_frame
+from links.mavlink.poses.odom_frame import odom_frame
+from links.mavlink.poses.own_estimate import OwnEvent
 from links.mavlink.poses.pose_sender import PoseSender
 from links.mavlink.poses.sent_state import SentState
 from links.mavlink.source_switch import SourceSwitch
@@ -89,7 +89,6 @@ class AutopilotSession:
         self._split_connection = 0  # `reconnects` of the splitter's bytes
         self._mav = dialect().MAVLink(None, srcSystem=own[0], srcComponent=own[1])
         self._sent: deque[Record] = deque(maxlen=SENT_RECORDS)
-        self._own_position: OwnPosition | None = None
         self._earlier_odom: tuple[int, bytes] | None = None  # of an earlier run, until it is a record
         if self._sent_state.earlier is not None:
             earlier_ns, pose, odom = self._sent_state.earlier
@@ -146,7 +145,7 @@ class AutopilotSession:
             if sent:
                 self.poses.on_sent(pose, now_ns, sent)
                 if any(message.get_type() in POSES for message in sent):
-                    self.switch.on_sent(pose, self.poses.attitude.newest, self._own_position, now_ns)
+                    self.switch.on_sent(pose, self.poses.own, now_ns)
             self._send_texts(now_ns)
 
     def sent(self) -> list[Record]:
@@ -251,10 +250,7 @@ class AutopilotSession:
                 self._target_ns, self._target_connection = self._now_ns(), self.connection.reconnects
                 self.origin.on_message(message)
                 self.poses.on_estimator_status(message, arrival_ns)
-                if message.get_type() == "ATTITUDE":
-                    self._on_attitude(message, arrival_ns)
-                elif message.get_type() == "LOCAL_POSITION_NED":
-                    self._own_position = OwnPosition.of(message, arrival_ns)
+                self._on_own_estimate(self.poses.own.add(message, arrival_ns))
                 self.intervals.on_message(message, arrival_ns)
                 self.switch.on_message(message, arrival_ns)
                 if message.get_type() == "TIMESYNC":
@@ -264,17 +260,15 @@ class AutopilotSession:
                         return message.ts1
         return arrival_ns
 
-    def _on_attitude(self, message: Any, arrival_ns: int) -> None:
-        """The autopilot's attitude, and what it shows. The lock is held."""
-        event = self.poses.attitude.add(message, arrival_ns)
-        if event is AttitudeEvent.BOOTED:
+    def _on_own_estimate(self, event: OwnEvent | None) -> None:
+        """What the autopilot's own estimate shows. The lock is held."""
+        if event is OwnEvent.BOOTED:
             self.poses.on_boot()
             self.origin.restart()
+            self.intervals.restart()
             self.switch.on_boot()
-        elif event is AttitudeEvent.YAW_RESET:
+        elif event is OwnEvent.YAW_RESET:
             self.poses.on_yaw_reset()
-        if self.poses.attitude.newest is not None:
-            self.poses.on_attitude(self.poses.attitude.newest)
 
     def _accept_for_heartbeats(self, source: tuple[str, int]) -> None:
         """Send heartbeats, but no poses, to an autopilot that signs with an old time until it receives our time.
@@ -356,7 +350,6 @@ class AutopilotSession:
         self.counts[f"sent: {kind}"] += 1
         self._independence.on_sent(kind, now_ns)
         if kind in POSES and pose is not None:
-            own = self.poses.attitude.newest, self._own_position
-            self._sent_state.on_sent(frame, now_ns, lambda: odom_frame(pose, *own, self._own))
+            self._sent_state.on_sent(frame, now_ns, lambda: odom_frame(pose, self.poses.own, self._own))
         self._sent.append(Record(self._sent_topic, now_ns, now_ns, frame))
         return True

@@ -29,8 +29,7 @@ from typing import Any
 
 from links.mavlink.commands import ACCEPTED, IN_PROGRESS, REPLY_NS, TEMPORARILY_REJECTED, command_long, is_answer
 from links.mavlink.poses.agreement import Agreement
-from links.mavlink.poses.odom_frame import OwnPosition
-from links.mavlink.poses.position_messages import OwnAttitude
+from links.mavlink.poses.own_estimate import OwnEstimate
 from links.mavlink.profiles import EXTERNAL, RequiredParameter, findings
 from links.mavlink.readers import CONSTANT_POSITION, HORIZONTAL_RELATIVE
 from links.mavlink.transport.framing import dialect
@@ -114,15 +113,15 @@ class SourceSwitch:
         elif is_answer(message, SET_EKF_SOURCE_SET, self._own):
             self._on_result(message.result)
 
-    def on_sent(self, pose: RelativePose, own: OwnAttitude | None, position: OwnPosition | None, now_ns: int) -> None:
-        """A pose was sent; `own`, `position`: the autopilot's newest attitude and position."""
+    def on_sent(self, pose: RelativePose, own: OwnEstimate, now_ns: int) -> None:
+        """A pose was sent; `own`: the autopilot's estimate."""
         if self._set is None:
             return
         if self._sending_ns is None or now_ns - self._sent_ns > FALLBACK_NS:
             self._sending_ns = now_ns
             self.agreement.restart()
         self._sent, self._sent_ns = pose, now_ns
-        off_m = self.agreement.add(pose, own, position)
+        off_m = self.agreement.add(pose, own)
         if off_m is not None and self.active != self._set:
             self._warn(f"pose and autopilot differ by {off_m:.1f} m")
 

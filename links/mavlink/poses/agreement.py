@@ -21,8 +21,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from links.mavlink.poses.odom_frame import OwnPosition, odom_yaw_rad
-from links.mavlink.poses.position_messages import OwnAttitude
+from links.mavlink.poses.odom_frame import odom_yaw_rad
+from links.mavlink.poses.own_estimate import OwnEstimate
 from stages.geometry.frames import Array64, rotation_z
 from stages.messages import RelativePose
 
@@ -54,9 +54,10 @@ class Agreement:
         """The autopilot has booted, or poses were not sent for a while."""
         self._reference = self._agreed_ns = None
 
-    def add(self, pose: RelativePose, own: OwnAttitude | None, position: OwnPosition | None) -> float | None:
+    def add(self, pose: RelativePose, own: OwnEstimate) -> float | None:
         """Add a pose that was sent, and the autopilot's newest estimate; returns the distance [m] when it disagrees."""
-        yaw_rad, xyz_odom_m = odom_yaw_rad(pose, own), None if position is None else position.at(pose.stamp_ns)
+        yaw_rad = odom_yaw_rad(pose, own)
+        xyz_odom_m = None if own.position is None else own.position.at(pose.stamp_ns)
         if pose.xyz_map_m is None or yaw_rad is None or xyz_odom_m is None:
             return None
         first = self._reference

@@ -12,7 +12,6 @@ Source: ours.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,55 +22,32 @@ from links.mavlink.ned_frd import (
     upper_from_pose_covariance,
     wxyz_from_R_odom_drone,
 )
+from links.mavlink.poses.own_estimate import OwnEstimate
 from links.mavlink.poses.pose_messages import BODY_FRD, LOCAL_FRD, UNKNOWN_COVARIANCE, VIO
-from links.mavlink.poses.position_messages import OwnAttitude
 from links.mavlink.readers import read_odometry
 from links.mavlink.transport.framing import dialect
 from stages.fuse.chain import yaw_sigma_rad
-from stages.geometry.frames import Array64, heading_rad, rotation_z
+from stages.geometry.frames import heading_rad, rotation_z
 from stages.messages import EarlierOdomFrame, PoseEstimate, RelativePose
 
-OWN_AGE_NS = 300_000_000  # of its position against the pose; it is extrapolated by its velocity
 
-
-@dataclass(frozen=True, slots=True)
-class OwnPosition:
-    """The autopilot's own position as it reported it, in grd's axes."""
-
-    arrival_ns: int
-    xyz_odom_m: Array64
-    velocity_odom_mps: Array64
-
-    @classmethod
-    def of(cls, message: Any, arrival_ns: int) -> OwnPosition | None:
-        """LOCAL_POSITION_NED; None: not finite."""
-        values = np.array([message.x, message.y, message.z, message.vx, message.vy, message.vz])
-        return cls(arrival_ns, flip_yz(values[:3]), flip_yz(values[3:])) if np.isfinite(values).all() else None
-
-    def at(self, stamp_ns: int) -> Array64 | None:
-        """Position at a time; None: too old."""
-        since_ns = stamp_ns - self.arrival_ns
-        return None if abs(since_ns) > OWN_AGE_NS else self.xyz_odom_m + 1e-9 * since_ns * self.velocity_odom_mps
-
-
-def odom_yaw_rad(pose: RelativePose, own: OwnAttitude | None) -> float | None:
+def odom_yaw_rad(pose: RelativePose, own: OwnEstimate) -> float | None:
     """Yaw of the autopilot's axes in `map`; None: not known."""
+    attitude = own.attitude
     if pose.odom_yaw_rad is not None:
         return pose.odom_yaw_rad
-    if own is None or not isinstance(pose.estimate, PoseEstimate):
+    if attitude is None or not isinstance(pose.estimate, PoseEstimate):
         return None
-    R_odom_drone = R_odom_drone_from_rpy(own.roll_rad, own.pitch_rad, own.yaw_rad)
+    R_odom_drone = R_odom_drone_from_rpy(attitude.roll_rad, attitude.pitch_rad, attitude.yaw_rad)
     return heading_rad(pose.estimate.R_map_drone) - heading_rad(R_odom_drone)
 
 
-def odom_frame(
-    pose: RelativePose, own: OwnAttitude | None, position: OwnPosition | None, sender: tuple[int, int]
-) -> bytes | None:
+def odom_frame(pose: RelativePose, own: OwnEstimate, sender: tuple[int, int]) -> bytes | None:
     """Frame of `odom` in `map` at a pose that was sent; None: not known."""
     yaw_rad, sigma_rad = odom_yaw_rad(pose, own), pose.odom_yaw_sigma_rad
     if pose.odom_yaw_rad is None and isinstance(pose.estimate, PoseEstimate):
         sigma_rad = yaw_sigma_rad(pose.estimate.R_map_drone, pose.estimate.map_covariance)
-    xyz_odom_m = None if position is None else position.at(pose.stamp_ns)
+    xyz_odom_m = None if own.position is None else own.position.at(pose.stamp_ns)
     if yaw_rad is None or sigma_rad is None or xyz_odom_m is None or pose.xyz_map_m is None:
         return None
     R_map_odom = rotation_z(yaw_rad)

@@ -22,12 +22,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from links.mavlink.poses.attitude_monitor import AttitudeMonitor
 from links.mavlink.poses.fusion_monitor import FusionMonitor, OnRejection
 from links.mavlink.poses.gate import PoseLimits, RejectReason, reject_reason
+from links.mavlink.poses.own_estimate import OwnEstimate
 from links.mavlink.poses.pose_messages import landing_target, odometry, vision_position_estimate
 from links.mavlink.poses.position_gate import gate_reason
-from links.mavlink.poses.position_messages import OwnAttitude, position_odometry, position_vision_estimate
+from links.mavlink.poses.position_messages import position_odometry, position_vision_estimate
 from links.mavlink.poses.status_texts import StatusTexts
 from links.mavlink.profiles import ProfileName, YawOutput
 from links.mavlink.transport.framing import SEQUENCE
@@ -69,7 +69,6 @@ class PoseSender:
         self._limits = limits
         self._yaw: YawOutput = yaw
         self._profile: ProfileName = profile
-        self._attitude: OwnAttitude | None = None
         self._poses_sent = self._yaw_reset = False  # since the autopilot's boot
         self._odom_yaw_rad: float | None = None  # of the newest pose that had one
         self._other_boot_rad: float | None = None  # yaw of its axes before its newest boot: not valid any more
@@ -82,7 +81,7 @@ class PoseSender:
         self._sending = False
         self.texts = StatusTexts()
         self.fusion = FusionMonitor(on_rejection)
-        self.attitude = AttitudeMonitor()
+        self.own = OwnEstimate()
 
     @property
     def sending(self) -> bool:
@@ -106,10 +105,6 @@ class PoseSender:
         else:
             self._update_reset_counter(pose, now_ns)
         return [self._message(kind, pose) for kind in sendable]
-
-    def on_attitude(self, attitude: OwnAttitude) -> None:
-        """The autopilot's own attitude: positions for ArduPilot contain it."""
-        self._attitude = attitude
 
     def on_yaw_reset(self) -> None:
         """The autopilot has reset its yaw. Once its telemetry contains our poses, its axes are then unknown."""
@@ -177,7 +172,7 @@ class PoseSender:
 
     def _axes_reason(self, pose: RelativePose, now_ns: int) -> RejectReason | None:
         """Why the autopilot's axes are not those that were learnt. The first ATTITUDE after a silence shows a boot."""
-        own = self._attitude
+        own = self.own.attitude
         if own is None or now_ns - own.arrival_ns > ATTITUDE_NS:
             return RejectReason.NO_ATTITUDE
         if self._yaw_reset:
@@ -204,7 +199,7 @@ class PoseSender:
         return landing_target(pose)
 
     def _position_message(self, kind: PoseMessage, pose: RelativePose) -> Any:
-        own = self._attitude if self._profile == "ardupilot" else None
+        own = self.own.attitude if self._profile == "ardupilot" else None
         if kind == "odometry":
             return position_odometry(pose, self.reset_counter, self._limits, own, self._moved_m(pose))
         assert own is not None  # PX4 has no VISION_POSITION_ESTIMATE

@@ -2,7 +2,7 @@
 
 One request is under way at a time, because an acknowledgement does not name its message. A request without one is
 repeated; a denied rate is halved, an unsupported message replaced by the next alternative. The requests start again
-after a reboot (time since boot runs backwards) and after silence. The rates that arrive are measured: one that falls
+after a boot of the autopilot and after silence. The rates that arrive are measured: one that falls
 below what was accepted is requested again, and the IMU below 10 Hz is a status with what to do.
 
 What the autopilots do with a request:
@@ -43,7 +43,6 @@ RETRY_NS = 10_000_000_000  # between requests for a message that is given up, or
 WINDOW_NS = 2_000_000_000  # in which a rate is measured
 NEEDED_IMU_HZ = 10.0  # heading and preintegration work from this rate on
 LOW_SHARE = 0.7  # of the accepted rate: below, it is requested again
-REBOOT_MS = 1000  # time since boot that runs backwards by more: a reboot
 NAMES: dict[str, int] = {
     "SCALED_IMU": 26,
     "RAW_IMU": 27,
@@ -119,7 +118,6 @@ class MessageIntervals:
         )
         self._counts: Counter[str] = Counter()
         self._rates: dict[str, _Rate] = {}
-        self._boot_ms = 0
         self._imu_names = IMU_MESSAGES[profile] if rates.imu_hz else ()
         self._begin()
 
@@ -160,11 +158,6 @@ class MessageIntervals:
     def on_message(self, message: Any, now_ns: int) -> None:
         """Take a message of the autopilot."""
         kind = message.get_type()
-        boot_ms = getattr(message, "time_boot_ms", None)
-        if boot_ms is not None:
-            if boot_ms < self._boot_ms - REBOOT_MS:
-                self.restart()
-            self._boot_ms = boot_ms
         if kind in NAMES:
             self._rates.setdefault(kind, _Rate(now_ns)).count += 1
         elif is_answer(message, SET_MESSAGE_INTERVAL, self._own):

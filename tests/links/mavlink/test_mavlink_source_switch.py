@@ -15,8 +15,7 @@ from pymavlink.dialects.v20 import ardupilotmega
 
 from links.mavlink import Autopilot, source_switch
 from links.mavlink.poses.agreement import LEAST_M, Agreement
-from links.mavlink.poses.odom_frame import OwnPosition
-from links.mavlink.poses.position_messages import OwnAttitude
+from links.mavlink.poses.own_estimate import OwnAttitude, OwnEstimate, OwnPosition
 from links.mavlink.profiles import required_parameters
 from links.mavlink.source_switch import SET_EKF_SOURCE_SET, SourceSwitch
 from links.mavlink.transport.framing import packed, parse_frame
@@ -49,7 +48,7 @@ class Flight:
         self.yaw_error_rad, self.compass_rad = 0.0, 0.0
         self.measured = True
         self.own_speed_mps = 1.0
-        self.own: OwnPosition | None = None
+        self.own = OwnEstimate()
 
     def fly(self, seconds: float) -> Flight:
         for _ in range(round(50 * seconds)):
@@ -71,15 +70,17 @@ class Flight:
             give(mavlink.MAVLink_ekf_status_report_message(self.flags, 0.1, self.ratio, 0, 0, 0))
         if self.flags == POSITION:
             v = self.own_speed_mps
-            message = mavlink.MAVLink_local_position_ned_message(0, 50 + v * x_m, 7, -30, v, 0, 0)
-            self.own, _ = OwnPosition.of(message, self.now_ns), give(message)
+            message = mavlink.MAVLink_local_position_ned_message(self.step * 20, 50 + v * x_m, 7, -30, v, 0, 0)
+            self.own.add(message, self.now_ns)
+            give(message)
         if self.poses:
             pose = good_pose(
                 self.now_ns, xyz_map_m=np.array([x_m, 2.0, 10.0]), R_map_drone=rotation_z(self.yaw_error_rad)
             )
             measured_ns = self.now_ns if self.measured else self.now_ns - 2_000 * MS
             pose = dataclasses.replace(pose, odom_yaw_rad=None, measured_ns=measured_ns)
-            self.switch.on_sent(pose, OwnAttitude(0.0, 0.0, self.compass_rad, self.now_ns), self.own, self.now_ns)
+            self.own.attitude = OwnAttitude(0.0, 0.0, self.compass_rad, self.now_ns)
+            self.switch.on_sent(pose, self.own, self.now_ns)
 
     def _answer(self, request: Any) -> None:
         if request.get_type() == "PARAM_REQUEST_READ":
@@ -140,11 +141,11 @@ def test_the_set_is_not_requested_while_a_condition_does_not_hold(changes: dict[
 
 
 def test_a_drone_that_hovers_gives_no_evidence_that_its_poses_are_right():
-    agreement, now_ns = Agreement(), HOST0
+    agreement, own, now_ns = Agreement(), OwnEstimate(), HOST0
     for _ in range(1500):
         now_ns += 20 * MS
-        own = OwnPosition(now_ns, np.array([1.0, 2.0, 3.0]), np.zeros(3))
-        assert agreement.add(good_pose(now_ns), None, own) is None
+        own.position = OwnPosition(now_ns, np.array([1.0, 2.0, 3.0]), np.zeros(3))
+        assert agreement.add(good_pose(now_ns), own) is None
     assert not agreement.agrees(now_ns)
 
 

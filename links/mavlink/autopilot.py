@@ -119,6 +119,7 @@ class Autopilot(Source[AutopilotSettings]):
         self._session: AutopilotSession | None = None
         self._signer: Signer | None = None  # used by all sessions, as is `_poses`, which knows what the autopilot got
         self._poses: PoseSender | None = None
+        self._sent_state: SentState | None = None
         self._not_connected: int = 0
 
     def decode(self, record: Record) -> AutopilotMessage | EarlierOdomFrame | None:
@@ -170,6 +171,8 @@ class Autopilot(Source[AutopilotSettings]):
         """Open a session on a connection. A simulation in virtual time has its own clock and no thread."""
         settings = self.settings
         target = settings.system_id, settings.component_id
+        if self._sent_state is None:
+            self._sent_state = SentState(settings.state_file, now_ns())
         if self._poses is None:
             self._poses = PoseSender(
                 settings.send,
@@ -197,7 +200,7 @@ class Autopilot(Source[AutopilotSettings]):
             now_ns,
             (settings.topic, SENT_TOPIC),
             self._decoder.independence,
-            SentState(settings.state_file, now_ns()),
+            self._sent_state,
             threaded=threaded,
         )
         return self._session

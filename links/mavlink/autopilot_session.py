@@ -53,6 +53,7 @@ REJECTED = (
     "the autopilot's EKF rejects the position: no poses are sent. Is its compass, its GPS or the servo's mount wrong?"
 )
 EARLIER_POSE = "ODOMETRY"  # of an earlier run
+RESTART_NS = 600_000_000_000  # an earlier pose is probably of the same flight, which lasts 10 minutes
 SENT_RECORDS = 4096  # kept until `sent` is called
 
 
@@ -90,11 +91,14 @@ class AutopilotSession:
         self._mav = dialect().MAVLink(None, srcSystem=own[0], srcComponent=own[1])
         self._sent: deque[Record] = deque(maxlen=SENT_RECORDS)
         self._earlier_odom: tuple[int, bytes] | None = None  # of an earlier run, until it is a record
-        if self._sent_state.earlier is not None:
-            earlier_ns, pose, odom = self._sent_state.earlier
+        earlier = self._sent_state.take_earlier()
+        if earlier is not None:
+            earlier_ns, pose, odom = earlier
             independence.on_sent(EARLIER_POSE, earlier_ns)
             self._sent.append(Record(self._sent_topic, now_ns(), earlier_ns, pose))
             self._earlier_odom = None if odom is None else (earlier_ns, odom)
+            if now_ns() - earlier_ns < RESTART_NS:
+                poses.texts.warn(f"restarted {(now_ns() - earlier_ns) * 1e-9:.0f} s after its last pose")
         self._lock = threading.Lock()  # for numbering, signing and sending
         self._closed = threading.Event()
         self._heartbeat_ns = self._request_ns = 0

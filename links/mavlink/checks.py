@@ -23,6 +23,7 @@ from links.preflight.check_result import CheckResult, fail, ok, warning
 from links.preflight.link_checks import LinkChecks, declares
 from links.preflight.observations import Observation, Observations, ObservedSource
 from links.preflight.record_statistics import RecordStatistics
+from stages.fuse import Fuse, InertialFuse
 from stages.messages import AutopilotEstimator, AutopilotStatus, RelativePose
 from stages.odometry.drone.trajectory import BRIDGED_NS
 
@@ -84,6 +85,7 @@ class AutopilotChecks(LinkChecks):
             yield warning(
                 "autopilot pose", "not wired (inputs: {pose: fuse.relative_pose}): no pose is sent to the drone"
             )
+        yield from _unsendable(graph)
 
     def check_source(self, source: ObservedSource, observations: Observations) -> Iterator[CheckResult]:
         """See LinkChecks."""
@@ -96,6 +98,31 @@ class AutopilotChecks(LinkChecks):
                 yield warning(f"{source.name} parameters", "not in a recording: not checked")
             elif isinstance(source.link, Autopilot) and source.observation.records.count:
                 yield _parameters(source.name, source.link)
+
+
+def _unsendable(graph: Graph) -> Iterator[CheckResult]:
+    """Autopilots whose setting `yaw` needs what the stage of their poses does not estimate: the gate rejects all."""
+    for edge in graph.edges:
+        link = graph.nodes[edge.consumer]
+        if edge.message is not RelativePose or not issubclass(link.cls, Autopilot):
+            continue
+        stage, settings = graph.nodes[edge.producer], link.build().settings
+        if set(settings.send) <= {"landing_target"}:
+            continue
+        name = f"{edge.consumer} yaw"
+        if settings.yaw == "none" and issubclass(stage.cls, InertialFuse):
+            yield fail(
+                name,
+                f"{edge.producer} (InertialFuse) does not estimate the autopilot's axes: no pose would be sent with "
+                "yaw: none; set yaw: measured, or use stages.fuse.Fuse",
+            )
+        wired = {other.port for other in graph.edges if other.consumer == edge.producer}
+        if settings.yaw == "measured" and issubclass(stage.cls, Fuse) and "rotation" not in wired:
+            yield fail(
+                name,
+                f"{edge.producer} (Fuse) measures no yaw without cameras: no pose would be sent with yaw: measured; "
+                "use vision.yaml or inertial.yaml, or set yaw: none",
+            )
 
 
 def autopilot_checks(

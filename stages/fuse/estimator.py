@@ -56,7 +56,8 @@ class Estimator:
         self.resets, self.track_id = 0, 0
         self.unverified = False  # the new track may be of another object than the one before
         self._was_still = False
-        self._prior: HeadingPrior | None = None
+        self._prior: HeadingPrior | None = None  # of an earlier run, until a yaw was known in this one
+        self._prior_done = False
         self._agreed = 0  # consecutive LiDAR positions at the position of the prior
         self.newest_fix_ns: int | None = None  # also when the drone is lost
         self.unconfirmed_ns: int | None = None  # newest rotation by vanishing points that no motion has confirmed
@@ -97,9 +98,10 @@ class Estimator:
         self._prior = prior
 
     def _use_prior(self, stamp_ns: int, z: Array64, noise: MeasurementCovariance) -> None:
-        """Take it when no yaw is known and PRIOR_FIXES LiDAR positions in a row are where the autopilot is by it."""
+        """Take it once, before any yaw is known, when PRIOR_FIXES LiDAR positions in a row agree with it."""
         prior = self._prior
-        if self.odometry_yaw.yaw is not None or prior is None or abs(stamp_ns - prior.stamp_ns) > PRIOR_NS:
+        self._prior_done = self._prior_done or self.odometry_yaw.yaw is not None
+        if self._prior_done or prior is None or abs(stamp_ns - prior.stamp_ns) > PRIOR_NS:
             self._agreed = 0
             return
         covariance_m2 = noise.whole_m2 + prior.position_sigma_m**2 * np.eye(3)

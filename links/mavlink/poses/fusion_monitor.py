@@ -8,8 +8,12 @@ then, and a reset to a pose that contradicts the autopilot's own sensors may be 
     reset    the reset counter changes, so that the EKF takes the pose; after MAX_RESETS in a row as `stop`
     report   only a text and a counter
 
-Source: ours; ArduPilot NavEKF3_core::send_status_report (square roots of ratios), FS_EKF_THRESH 0.8 for 1 s;
-https://mavlink.io/en/messages/common.html#ESTIMATOR_STATUS.
+REJECTED_NS is shorter than the second after which the EKF failsafe acts. ArduPilot's position times out 7 s after the
+last fused pose: within RESUME_NS it is known whether a position is accepted again; a reset that holds for SETTLED_NS
+was right.
+
+Source: ours; ArduPilot NavEKF3_core::send_status_report (square roots of ratios), ekf_check.cpp (FS_EKF_THRESH 0.8 for
+1 s), posRetryTimeNoVel_ms; https://mavlink.io/en/messages/common.html#ESTIMATOR_STATUS.
 """
 
 from __future__ import annotations
@@ -20,7 +24,7 @@ from typing import Any, Literal
 OnRejection = Literal["stop", "reset", "report"]
 
 REJECTED_NS = 600_000_000  # ratio above 1 for so long, before ArduPilot's failsafe of 1 s
-RESUME, RESUME_NS = 0.5, 3_000_000_000
+RESUME, RESUME_NS = 0.5, 3_000_000_000  # half the innovation that the gate allows, as preflight warns of
 MAX_RESETS = 3
 SETTLED_NS = 5_000_000_000  # without rejection, after which resets are counted again from zero
 STALE_NS = 2_000_000_000  # between two status messages: no statement in between

@@ -32,7 +32,7 @@ from links.mavlink.poses.status_texts import StatusTexts
 from links.mavlink.profiles import ProfileName, YawOutput
 from links.mavlink.transport.framing import SEQUENCE
 from stages.geometry.frames import Array64
-from stages.messages import RelativePose
+from stages.messages import PoseState, RelativePose
 
 PoseMessage = Literal["odometry", "vision_position_estimate", "landing_target"]
 
@@ -79,7 +79,8 @@ class PoseSender:
         self._newest_ns: int | None = None  # stamp of the newest pose of which anything was sent
         self._incremented = False  # the reset counter, since `_sent`
         self._sending = False
-        self.texts = StatusTexts()
+        sufficient = (PoseState.FULL, PoseState.POSITION_ONLY) if yaw == "none" else (PoseState.FULL,)
+        self.texts = StatusTexts(sufficient)
         self.fusion = FusionMonitor(on_rejection)
         self.own = OwnEstimate()
 

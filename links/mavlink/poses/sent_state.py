@@ -26,7 +26,7 @@ WRITE_NS = 1_000_000_000  # period of writing
 
 
 class SentState:
-    """Reads the file when it is made; `write` is called regularly, by one thread, and may block."""
+    """One per run. Reads the file when it is made; `write` is called regularly, by one thread, and may block."""
 
     def __init__(self, file: Path | None, now_ns: int) -> None:
         self.status: str | None = None
@@ -35,8 +35,15 @@ class SentState:
         self._newest: tuple[int, bytes] | None = None
         self._odom: bytes | None = None
         self._written_ns: int | None = None
-        self.earlier = self._read(now_ns)
-        """Time and frame of the newest pose of earlier runs, and frame odom in `map` then; None: none."""
+        self._earlier = self._read(now_ns)
+
+    def take_earlier(self) -> tuple[int, bytes, bytes | None] | None:
+        """Time and frame of the newest pose of earlier runs, and frame odom in `map` then; None: none, or taken before.
+
+        A link that is reopened has another session of the same run: what this run knew then is not reported.
+        """
+        earlier, self._earlier = self._earlier, None
+        return earlier
 
     def on_sent(self, frame: bytes, sent_ns: int, odom: Callable[[], bytes | None] = lambda: None) -> None:
         """A pose was sent; `odom`: makes frame odom in `map`, called when it will be written."""

@@ -13,6 +13,7 @@ Source: ours; https://mavlink.io/en/messages/common.html#STATUSTEXT.
 from __future__ import annotations
 
 import re
+from collections.abc import Collection
 from typing import Any, Literal, get_args
 
 from links.mavlink.transport.framing import dialect
@@ -25,7 +26,6 @@ HOLD_NS = 1_000_000_000  # a state, or sending, is reported after it has lasted 
 TEXT_BYTES = 50  # size of STATUSTEXT's text field
 PREFIX = "grd: "
 CRITICAL, WARNING, NOTICE, INFO = 2, 4, 5, 6  # MAV_SEVERITY
-SEVERITY = {PoseState.FULL: INFO, PoseState.COASTING: WARNING}  # of a state; other states: warning
 CLAUSE = re.compile(r"[;:,]")
 
 
@@ -41,7 +41,9 @@ def fitted(text: str) -> bytes:
 class StatusTexts:
     """Waiting texts. Call `due` about ten times per second."""
 
-    def __init__(self) -> None:
+    def __init__(self, sufficient: Collection[PoseState] = (PoseState.FULL,)) -> None:
+        """`sufficient`: states in which poses are sent; the others are warnings."""
+        self._sufficient = frozenset(sufficient)
         self._waiting: dict[TextKind, tuple[int, str]] = {}  # severity and text
         self._text_ns: int | None = None
         self._offered: tuple[TextKind, int, str] | None = None  # the newest result of `due`
@@ -98,4 +100,4 @@ class StatusTexts:
         state, reason, since_ns = self._state
         if state is not self._reported and now_ns - since_ns >= HOLD_NS:
             self._reported = state
-            self._waiting["state"] = SEVERITY.get(state, WARNING), f"{state.name}: {reason}"
+            self._waiting["state"] = INFO if state in self._sufficient else WARNING, f"{state.name}: {reason}"

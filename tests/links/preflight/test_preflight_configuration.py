@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from pathlib import Path
+from typing import Any
+
+import pytest
 
 from flow.graph import load_graph
 from links.preflight.graphs import sources_only, tracking
@@ -43,3 +47,25 @@ def test_no_pose_is_sent_and_nothing_moves_with_the_sources_only():
     assert not any(edge.consumer == "autopilot" for edge in subgraph.edges)
     assert any((edge.producer, edge.consumer) == ("aim", "servo") for edge in subgraph.edges)
     assert {"lidar", "servo", "camera_drone", "detect", "track"} <= set(subgraph.nodes)
+
+
+@pytest.mark.parametrize(
+    ("config", "setting", "level"),
+    [
+        ("inertial.yaml", {}, None),
+        ("inertial.yaml", {"yaw": "none"}, "InertialFuse) does not estimate the autopilot's axes"),
+        ("inertial.yaml", {"yaw": "none", "send": ["landing_target"]}, None),
+        ("field.yaml", {}, None),
+        ("field.yaml", {"yaw": "measured"}, None),  # with cameras
+        ("sim_flight.yaml", {"yaw": "measured"}, "Fuse) measures no yaw without cameras"),
+    ],
+)
+def test_a_yaw_that_the_stage_of_the_poses_does_not_estimate_is_an_error(
+    config: str, setting: dict[str, Any], level: str | None, tmp_path: Path
+):
+    pose = "inputs: {pose: fuse.relative_pose}"
+    text = f"include: {CONFIGS / config}\nlinks: {{autopilot: {{config: {json.dumps(setting)}, {pose}}}}}\n"
+    (tmp_path / "config.yaml").write_text(text, encoding="utf-8")
+    found = [r for r in configuration_checks(load_graph(tmp_path / "config.yaml")) if r.name == "autopilot yaw"]
+    assert [r.level.value for r in found] == ([] if level is None else ["fail"])
+    assert level is None or level in found[0].sentence

@@ -16,7 +16,7 @@ from flow.link import Record
 from links.clock import host_time
 from links.mavlink import Autopilot
 from links.mavlink.poses.sent_state import SentState
-from links.mavlink.transport.framing import packed
+from links.mavlink.transport.framing import packed, parse_frame
 from stages.geometry.frames import rotation_z
 from stages.messages import DroneAttitude, EarlierOdomFrame
 from tests.links.mavlink.mavlink_poses import good_pose
@@ -29,14 +29,14 @@ S = 1_000_000_000
 def test_the_newest_pose_is_kept(tmp_path: Path):
     file = tmp_path / "new" / "sent.json"
     state = SentState(file, 5 * S)
-    assert state.earlier is None
+    assert state.take_earlier() is None
     state.write()
     assert not file.exists()  # nothing was sent
     for i in range(4):
         state.on_sent(bytes([i]), (5 + i) * S)
         state.write()
-    assert SentState(file, 10 * S).earlier == (8 * S, b"\x03", None)
-    assert SentState(file, 7 * S).earlier == (7 * S, b"\x03", None)  # not from the future
+    assert SentState(file, 10 * S).take_earlier() == (8 * S, b"\x03", None)
+    assert SentState(file, 7 * S).take_earlier() == (7 * S, b"\x03", None)  # not from the future
 
 
 def test_it_is_written_once_a_second(tmp_path: Path):
@@ -44,15 +44,17 @@ def test_it_is_written_once_a_second(tmp_path: Path):
     for i in range(1, 100):
         state.on_sent(bytes([i]), i * S // 50)
         state.write()
-    assert SentState(tmp_path / "sent.json", 10 * S).earlier == (51 * S // 50, bytes([51]), None)
+    assert SentState(tmp_path / "sent.json", 10 * S).take_earlier() == (51 * S // 50, bytes([51]), None)
 
 
 def test_a_damaged_file_counts_as_a_pose_sent_now_and_is_reported(tmp_path: Path):
     file = tmp_path / "sent.json"
     file.write_text("{")
     state = SentState(file, 5 * S)
-    assert state.earlier is not None
-    assert state.earlier[0] == 5 * S
+    earlier = state.take_earlier()
+    assert earlier is not None
+    assert earlier[0] == 5 * S
+    assert state.take_earlier() is None
     assert "delete it" in (state.status or "")
 
 
@@ -122,10 +124,26 @@ def test_the_frame_of_the_autopilot_is_known_after_a_restart_live_and_in_replay(
     assert yaw_rad == pytest.approx(0.8, abs=0.02)
     np.testing.assert_allclose(found[0].xyz_map_m + rotation_z(yaw_rad) @ [4, -2, 30], [101, 2, 10], atol=0.1)
     assert found[0].sigma_rad == pytest.approx(0.02, abs=0.002)
+    texts = [parse_frame(r.data).text for r in listener.link.sent() if parse_frame(r.data).get_type() == "STATUSTEXT"]
+    assert "grd: restarted 0 s after its last pose" in texts
     replayed = Autopilot()
     messages = [replayed.decode(record) for record in listener.records]
     again = [message for message in messages if isinstance(message, EarlierOdomFrame)]
     assert [(m.stamp_ns, m.yaw_map_odom_rad) for m in again] == [(found[0].stamp_ns, yaw_rad)]
+
+
+def test_a_link_that_is_reopened_does_not_report_its_own_run(tmp_path: Path):
+    drone = Drone(uptime_s=60.0)
+    with listening(state_file=str(tmp_path / "sent.json")) as listener:
+        drone.send(listener, 30, poses=True)
+        link = listener.link
+    with link.listen() as records:
+        again = Listener(link, records)
+        drone.send(again, 10, poses=False)
+    again.thread.join(5)
+    assert len(again.messages) >= 10
+    assert not any(isinstance(message, EarlierOdomFrame) for message in again.messages)
+    assert not any(m.independent for m in again.messages if isinstance(m, DroneAttitude))
 
 
 def test_an_echo_of_our_own_frames_is_no_earlier_run():

@@ -10,6 +10,7 @@ Source: https://mavlink.io/en/; requirements of each autopilot: `profiles.py`.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from ipaddress import IPv4Address
@@ -40,6 +41,7 @@ from stages.messages import EarlierOdomFrame, RelativePose
 
 VISUAL_INERTIAL_ODOMETRY = 197  # MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY: our component id
 SENT_TOPIC = "/autopilot/tx"
+IS_KEY = re.compile(r"(0x)?[0-9a-fA-F]{64}")
 
 
 class AutopilotSettings(SourceSettings):
@@ -81,6 +83,15 @@ class AutopilotSettings(SourceSettings):
     def _is_connection(cls, value: str | None) -> str | None:
         if value is not None:
             parse_connection(value)
+        return value
+
+    @field_validator("signing_key", mode="before")
+    @classmethod
+    def _is_a_file(cls, value: Any) -> Any:
+        if isinstance(value, str) and IS_KEY.fullmatch(value.strip()):
+            raise ValueError(
+                "must be the path of a key file, not the key: recordings and logs contain settings"
+            )
         return value
 
     @model_validator(mode="after")

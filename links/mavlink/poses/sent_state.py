@@ -75,12 +75,12 @@ class SentState:
             return None
         try:
             fields = json.loads(self._file.read_text(encoding="ascii"))
+            sent_ns, frame = int(fields["sent_ns"]), bytes.fromhex(fields["frame"])
             odom = fields.get("odom")
-            sent_ns, frame = min(int(fields["sent_ns"]), now_ns), bytes.fromhex(fields["frame"])
-            return sent_ns, frame, None if odom is None else bytes.fromhex(odom)
+            return max(0, min(sent_ns, now_ns)), frame, None if odom is None else bytes.fromhex(odom)
         except FileNotFoundError:
             return None
-        except (OSError, ValueError, TypeError, KeyError) as error:
+        except (OSError, ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
             self.status = f"{self._file} cannot be read ({error!r}): delete it after a reboot of the autopilot"
             return now_ns, _unknown_pose(), None
 

@@ -89,9 +89,7 @@ class AutopilotSettings(SourceSettings):
     @classmethod
     def _is_a_file(cls, value: Any) -> Any:
         if isinstance(value, str) and IS_KEY.fullmatch(value.strip()):
-            raise ValueError(
-                "must be the path of a key file, not the key: recordings and logs contain settings"
-            )
+            raise ValueError("must be the path of a key file, not the key: recordings and logs contain settings")
         return value
 
     @model_validator(mode="after")

@@ -36,16 +36,16 @@ from links.mavlink.poses.pose_sender import PoseSender
 from links.mavlink.poses.sent_state import SentState
 from links.mavlink.source_switch import SourceSwitch
 from links.mavlink.streams.message_intervals import MessageIntervals
-from links.mavlink.timesync_monitor import REQUEST_NS, TimesyncMonitor
+from links.mavlink.timesync_monitor import REQUEST_PERIOD_NS, TimesyncMonitor
 from links.mavlink.transport.connection import Connection
 from links.mavlink.transport.framing import FrameSplitter, dialect, header, packed
 from links.mavlink.transport.signing import Signer
 from stages.messages import RelativePose
 
 WAKE_S = 0.05  # period of the thread, and of the check whether a waiting reader was closed
-SILENT_S = 3.0  # three heartbeats
+SILENCE_REPORTED_S = 3.0  # three heartbeats
 SECOND_NS = 1_000_000_000
-QUIET_NS = 1_500_000_000  # one and a half heartbeats: no poses are sent
+MAX_SILENCE_NS = 1_500_000_000  # one and a half heartbeats: no poses are sent
 ONBOARD_CONTROLLER, NO_AUTOPILOT = 18, 8  # MAV_TYPE, MAV_AUTOPILOT_INVALID
 NO_CONNECTION = -1
 STANDBY, ACTIVE = 3, 4  # MAV_STATE
@@ -53,7 +53,7 @@ REJECTED = (
     "the autopilot's EKF rejects the position: no poses are sent. Is its compass, its GPS or the servo's mount wrong?"
 )
 EARLIER_POSE = "ODOMETRY"  # of an earlier run
-RESTART_NS = 600_000_000_000  # an earlier pose is probably of the same flight, which lasts 10 minutes
+RESTART_REPORTED_NS = 600_000_000_000  # an earlier pose is probably of the same flight, which lasts 10 minutes
 SENT_RECORDS = 4096  # kept until `sent` is called
 
 
@@ -97,7 +97,7 @@ class AutopilotSession:
             independence.on_sent(EARLIER_POSE, earlier_ns)
             self._sent.append(Record(self._sent_topic, now_ns(), earlier_ns, pose))
             self._earlier_odom = None if odom is None else (earlier_ns, odom)
-            if now_ns() - earlier_ns < RESTART_NS:
+            if now_ns() - earlier_ns < RESTART_REPORTED_NS:
                 poses.texts.warn(f"restarted {(now_ns() - earlier_ns) * 1e-9:.0f} s after its last pose")
         self._lock = threading.Lock()  # for numbering, signing and sending
         self._closed = threading.Event()
@@ -212,11 +212,12 @@ class AutopilotSession:
         )
 
     def _silence(self) -> str | None:
-        if self._now_ns() - self._target_ns < SILENT_S * SECOND_NS:
+        if self._now_ns() - self._target_ns < SILENCE_REPORTED_S * SECOND_NS:
             return None
         return (
             f"no frame from the autopilot (system {self._target[0]}, component {self._target[1]}) for "
-            f"{SILENT_S:g} s: is it powered, is this its connection, and are system_id and component_id correct?"
+            f"{SILENCE_REPORTED_S:g} s: is it powered, is this its connection, and are system_id and component_id "
+            "correct?"
         )
 
     def close(self) -> None:
@@ -245,7 +246,7 @@ class AutopilotSession:
             self.counts["received"] += 1
             if sender == self._target:
                 self.connection.reply_to(source)
-                if self._now_ns() - self._target_ns > SILENT_S * SECOND_NS:
+                if self._now_ns() - self._target_ns > SILENCE_REPORTED_S * SECOND_NS:
                     self.origin.restart()
                     self.intervals.restart()
                 if not self._is_reachable(self._now_ns()):
@@ -287,7 +288,7 @@ class AutopilotSession:
         """Whether the autopilot presumably receives frames now. Over UDP this includes one that never sent any."""
         if self._target_connection is None:
             return self.connection.datagrams
-        return self._target_connection == self.connection.reconnects and now_ns - self._target_ns < QUIET_NS
+        return self._target_connection == self.connection.reconnects and now_ns - self._target_ns < MAX_SILENCE_NS
 
     def _link_reason(self, now_ns: int) -> RejectReason | None:
         """Why no pose may be sent over the link now. The lock is held."""
@@ -307,7 +308,7 @@ class AutopilotSession:
             state = ACTIVE if self.poses.sending else STANDBY
             if self._send(dialect().MAVLink_heartbeat_message(ONBOARD_CONTROLLER, NO_AUTOPILOT, 0, 0, state, 3)):
                 self._heartbeat_ns = now_ns
-        if now_ns - self._request_ns >= REQUEST_NS:
+        if now_ns - self._request_ns >= REQUEST_PERIOD_NS:
             request_ns = self._now_ns()
             if self._send(dialect().MAVLink_timesync_message(0, request_ns)):
                 self._request_ns = now_ns

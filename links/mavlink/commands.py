@@ -10,7 +10,7 @@ from typing import Any
 from links.mavlink.transport.framing import dialect
 
 ACCEPTED, TEMPORARILY_REJECTED, DENIED, UNSUPPORTED, FAILED, IN_PROGRESS = range(6)  # MAV_RESULT
-REPLY_NS = 1_000_000_000  # a command without acknowledgement is repeated after this time
+ACK_TIMEOUT_NS = 1_000_000_000  # a command without acknowledgement is repeated after this time
 
 
 def command_long(target: tuple[int, int], command: int, *parameters: float) -> Any:

@@ -22,7 +22,7 @@ from links.mavlink.transport.framing import dialect
 
 REQUEST_MESSAGE, GPS_GLOBAL_ORIGIN = 512, 49  # MAV_CMD, message id
 HAS_NONE = (ACCEPTED, DENIED, FAILED)  # accepted (and sends nothing), denied, failed: it supports the message
-REQUEST_NS = 1_000_000_000  # period of requests
+REQUEST_PERIOD_NS = 1_000_000_000  # period of requests
 REQUESTS = 3
 UNCONFIRMED = 10  # times that an origin is sent before it is reported
 
@@ -77,7 +77,7 @@ class OriginSender:
         """Messages to send now."""
         if self.done or self._origin is None:
             return []
-        if self._requested_ns is not None and now_ns - self._requested_ns < REQUEST_NS:
+        if self._requested_ns is not None and now_ns - self._requested_ns < REQUEST_PERIOD_NS:
             return []
         if self._replies >= (REQUESTS if self.state is OriginState.REQUESTING else 1):
             self.state, self._replies, self._requested_ns = OriginState.SENT, 0, now_ns

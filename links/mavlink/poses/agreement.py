@@ -29,8 +29,8 @@ from stages.messages import RelativePose
 OWN_SIGMA_M, POSE_SIGMA_M = 0.5, 0.35
 TOLERANCE_M = 3.0 * math.hypot(OWN_SIGMA_M, POSE_SIGMA_M)  # 1.8 m
 LEAST_M = 2.0 * TOLERANCE_M  # 30 deg of yaw are then 1.04 of the tolerance
-REFERENCE_NS = 20_000_000_000
-HELD_NS = 60_000_000_000  # so long after the drone has moved they still count as agreeing
+REFERENCE_PERIOD_NS = 20_000_000_000
+AGREEMENT_VALID_NS = 60_000_000_000  # so long after the drone has moved they still count as agreeing
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,13 +74,13 @@ class Agreement:
             return off_m
         if float(np.linalg.norm(moved_m[:2])) >= LEAST_M:
             self._agreed_ns = pose.stamp_ns
-        if pose.stamp_ns - first.stamp_ns > REFERENCE_NS:
+        if pose.stamp_ns - first.stamp_ns > REFERENCE_PERIOD_NS:
             self._start(pose, xyz_odom_m)
         return None
 
     def agrees(self, now_ns: int) -> bool:
         """Whether they have moved alike by LEAST_M within the last minute, and have not disagreed since."""
-        return self._agreed_ns is not None and now_ns - self._agreed_ns < HELD_NS
+        return self._agreed_ns is not None and now_ns - self._agreed_ns < AGREEMENT_VALID_NS
 
     def _start(self, pose: RelativePose, xyz_odom_m: Array64) -> None:
         assert pose.xyz_map_m is not None

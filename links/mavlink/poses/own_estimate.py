@@ -24,11 +24,11 @@ import numpy as np
 from links.mavlink.ned_frd import flip_yz
 from stages.geometry.frames import Array64
 
-JUMP_RAD, JUMP_SHARE = math.radians(8.0), 0.3  # unexplained change of yaw, and share of the turn
-GAP_MS = 1000  # the rates do not explain the yaw over a longer gap
-BOOT_MS = 1000  # time since boot that runs backwards by more is another boot; by less, a late frame
+MIN_YAW_RESET_RAD, UNEXPLAINED_SHARE = math.radians(8.0), 0.3  # unexplained change of yaw, and share of the turn
+MAX_ATTITUDE_GAP_MS = 1000  # the rates do not explain the yaw over a longer gap
+MIN_BOOT_STEP_MS = 1000  # time since boot that runs backwards by more is another boot; by less, a late frame
 STEEP_RAD = math.radians(60.0)  # pitch or roll beyond which yaw is not evaluated
-POSITION_AGE_NS = 300_000_000  # of its position against a pose; it is extrapolated by its velocity
+MAX_POSITION_AGE_NS = 300_000_000  # of its position against a pose; it is extrapolated by its velocity
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +52,9 @@ class OwnPosition:
     def at(self, stamp_ns: int) -> Array64 | None:
         """Position at a time; None: too old."""
         since_ns = stamp_ns - self.arrival_ns
-        return None if abs(since_ns) > POSITION_AGE_NS else self.xyz_odom_m + 1e-9 * since_ns * self.velocity_odom_mps
+        return (
+            None if abs(since_ns) > MAX_POSITION_AGE_NS else self.xyz_odom_m + 1e-9 * since_ns * self.velocity_odom_mps
+        )
 
 
 class OwnEvent(enum.Enum):
@@ -77,7 +79,7 @@ class OwnEstimate:
         boot_ms = getattr(message, "time_boot_ms", None)
         if boot_ms is None:
             return None
-        booted = self._newest_ms is not None and boot_ms < self._newest_ms - BOOT_MS
+        booted = self._newest_ms is not None and boot_ms < self._newest_ms - MIN_BOOT_STEP_MS
         self._newest_ms = boot_ms if booted else max(boot_ms, self._newest_ms or 0)
         if booted:
             self.attitude = self.position = None
@@ -104,11 +106,11 @@ class OwnEstimate:
         turn = 0.5e-3 * elapsed_ms * (rate + self._yaw_rate)
         self.attitude = OwnAttitude(message.roll, message.pitch, message.yaw, arrival_ns)
         self._attitude_ms, self._yaw_rate = message.time_boot_ms, rate
-        if last is None or elapsed_ms > GAP_MS:
+        if last is None or elapsed_ms > MAX_ATTITUDE_GAP_MS:
             return False
         steep = max(abs(message.roll), abs(message.pitch), abs(last.roll_rad), abs(last.pitch_rad)) > STEEP_RAD
         unexplained = abs(math.remainder(message.yaw - last.yaw_rad - turn, math.tau))
-        return not steep and unexplained > JUMP_RAD + JUMP_SHARE * abs(turn)
+        return not steep and unexplained > MIN_YAW_RESET_RAD + UNEXPLAINED_SHARE * abs(turn)
 
 
 def _yaw_rate(roll: float, pitch: float, pitch_rate: float, yaw_rate: float) -> float:

@@ -36,8 +36,8 @@ from stages.messages import PoseState, RelativePose
 
 PoseMessage = Literal["odometry", "vision_position_estimate", "landing_target"]
 
-SILENCE_NS = 300_000_000  # the autopilot's timeout for poses
-ATTITUDE_NS = 1_000_000_000  # largest age of the autopilot's attitude
+POSE_TIMEOUT_NS = 300_000_000  # the autopilot's timeout for poses
+MAX_ATTITUDE_AGE_NS = 1_000_000_000  # largest age of the autopilot's attitude
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,8 +140,8 @@ class PoseSender:
             self.texts.on_sending(now_ns)
 
     def due_texts(self, now_ns: int) -> list[Any]:
-        """The STATUSTEXT that is due, if any. Also detects that no pose has been sent for SILENCE_NS."""
-        if self._sending and self._sent is not None and now_ns - self._sent.at_ns > SILENCE_NS:
+        """The STATUSTEXT that is due, if any. Also detects that no pose has been sent for POSE_TIMEOUT_NS."""
+        if self._sending and self._sent is not None and now_ns - self._sent.at_ns > POSE_TIMEOUT_NS:
             self._stop("no poses sent")
         return self.texts.due(now_ns)
 
@@ -154,7 +154,7 @@ class PoseSender:
         last = self._sent
         if last is None or self._incremented:
             return
-        if now_ns - last.at_ns > SILENCE_NS or pose.resets != last.resets or pose.track_id != last.track_id:
+        if now_ns - last.at_ns > POSE_TIMEOUT_NS or pose.resets != last.resets or pose.track_id != last.track_id:
             self.reset_counter = (self.reset_counter + 1) % SEQUENCE
             self._incremented = True
 
@@ -174,7 +174,7 @@ class PoseSender:
     def _axes_reason(self, pose: RelativePose, now_ns: int) -> RejectReason | None:
         """Why the autopilot's axes are not those that were learnt. The first ATTITUDE after a silence shows a boot."""
         own = self.own.attitude
-        if own is None or now_ns - own.arrival_ns > ATTITUDE_NS:
+        if own is None or now_ns - own.arrival_ns > MAX_ATTITUDE_AGE_NS:
             return RejectReason.NO_ATTITUDE
         if self._yaw_reset:
             return RejectReason.ODOM_YAW_RESET

@@ -22,7 +22,7 @@ from pathlib import Path
 
 from links.mavlink.transport.framing import dialect
 
-WRITE_NS = 1_000_000_000  # period of writing
+WRITE_PERIOD_NS = 1_000_000_000  # period of writing
 
 
 class SentState:
@@ -48,7 +48,7 @@ class SentState:
     def on_sent(self, frame: bytes, sent_ns: int, odom: Callable[[], bytes | None] = lambda: None) -> None:
         """A pose was sent; `odom`: makes frame odom in `map`, called when it will be written."""
         self._newest = sent_ns, frame
-        if self._file is not None and (self._written_ns is None or sent_ns - self._written_ns >= WRITE_NS):
+        if self._file is not None and (self._written_ns is None or sent_ns - self._written_ns >= WRITE_PERIOD_NS):
             self._odom = odom()
 
     def write(self) -> None:
@@ -56,7 +56,7 @@ class SentState:
         newest = self._newest
         if self._file is None or newest is None or newest[0] == self._written_ns:
             return
-        if self._written_ns is not None and newest[0] - self._written_ns < WRITE_NS:
+        if self._written_ns is not None and newest[0] - self._written_ns < WRITE_PERIOD_NS:
             return
         partial = self._file.with_suffix(".partial")
         try:

@@ -29,9 +29,9 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from links.mavlink.commands import (
     ACCEPTED,
+    ACK_TIMEOUT_NS,
     DENIED,
     IN_PROGRESS,
-    REPLY_NS,
     TEMPORARILY_REJECTED,
     command_long,
     is_answer,
@@ -39,8 +39,8 @@ from links.mavlink.commands import (
 from links.mavlink.profiles import ProfileName
 
 SET_MESSAGE_INTERVAL = 511  # MAV_CMD
-RETRY_NS = 10_000_000_000  # between requests for a message that is given up, or whose rate fell
-WINDOW_NS = 2_000_000_000  # in which a rate is measured
+RETRY_PERIOD_NS = 10_000_000_000  # between requests for a message that is given up, or whose rate fell
+RATE_WINDOW_NS = 2_000_000_000  # in which a rate is measured
 NEEDED_IMU_HZ = 10.0  # heading and preintegration work from this rate on
 LOW_SHARE = 0.7  # of the accepted rate: below, it is requested again
 NAMES: dict[str, int] = {
@@ -98,7 +98,7 @@ class _Rate:
     def update(self, now_ns: int) -> None:
         """Close windows that have ended."""
         elapsed_ns = now_ns - self.start_ns
-        if elapsed_ns >= WINDOW_NS:
+        if elapsed_ns >= RATE_WINDOW_NS:
             self.hz = self.count * 1e9 / elapsed_ns
             self.start_ns, self.count = now_ns, 0
 
@@ -137,10 +137,10 @@ class MessageIntervals:
             rate.update(now_ns)
         if self._pending is not None:
             stream, sent_ns = self._pending
-            if now_ns - sent_ns < REPLY_NS:
+            if now_ns - sent_ns < ACK_TIMEOUT_NS:
                 return None
             self._counts["message interval not acknowledged"] += 1
-            stream.answer, stream.next_ns, self._pending = "does not answer", now_ns + REPLY_NS, None
+            stream.answer, stream.next_ns, self._pending = "does not answer", now_ns + ACK_TIMEOUT_NS, None
         for stream in self._streams:
             self._renew(stream, now_ns)
         waiting = [stream for stream in self._streams if not stream.settled and now_ns >= stream.next_ns]
@@ -169,10 +169,10 @@ class MessageIntervals:
         (stream, _), self._pending = self._pending, None
         stream.next_ns = now_ns
         if result == ACCEPTED:
-            stream.settled, stream.answer, stream.next_ns = True, "", now_ns + RETRY_NS
+            stream.settled, stream.answer, stream.next_ns = True, "", now_ns + RETRY_PERIOD_NS
             self._rates[stream.name] = _Rate(now_ns)  # the old rate does not count
         elif result == TEMPORARILY_REJECTED:
-            stream.answer, stream.next_ns = "is busy", now_ns + REPLY_NS
+            stream.answer, stream.next_ns = "is busy", now_ns + ACK_TIMEOUT_NS
         elif result == DENIED and stream.rate_hz > NEEDED_IMU_HZ:
             self._counts[f"message interval denied: {stream.name} at {stream.rate_hz:.3g} Hz"] += 1
             stream.denied_hz = stream.denied_hz or stream.rate_hz
@@ -181,7 +181,7 @@ class MessageIntervals:
             stream.name_at += 1
         else:
             self._counts[f"message interval rejected: {stream.name}"] += 1
-            stream.settled, stream.answer, stream.next_ns = True, "rejects it", now_ns + RETRY_NS
+            stream.settled, stream.answer, stream.next_ns = True, "rejects it", now_ns + RETRY_PERIOD_NS
 
     def _renew(self, stream: _Stream, now_ns: int) -> None:
         """Request a message again some time after it was rejected, or when its rate fell."""
@@ -192,7 +192,7 @@ class MessageIntervals:
         if fell and not stream.answer:
             self._counts[f"message interval renewed: {stream.name}"] += 1
         stream.settled = not (fell or stream.answer)
-        stream.next_ns = now_ns if not stream.settled else now_ns + RETRY_NS
+        stream.next_ns = now_ns if not stream.settled else now_ns + RETRY_PERIOD_NS
 
     def imu_rate_hz(self) -> float | None:
         """Rate at which IMU messages arrive; None: not measured yet."""

@@ -253,8 +253,8 @@ def test_it_needs_ardupilot_and_another_set_than_the_first():
 
 
 def test_over_a_socket_the_request_is_made_and_its_acknowledgement_read(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(source_switch, "SETTLED_NS", 500 * MS)
-    monkeypatch.setattr(source_switch, "PARAMETER_NS", 20 * MS)
+    monkeypatch.setattr(source_switch, "MIN_SENDING_NS", 500 * MS)
+    monkeypatch.setattr(source_switch, "PARAMETER_PERIOD_NS", 20 * MS)
     values = {p.name: p.best for p in REQUIRED}
     sender, requested = mavlink.MAVLink(None, srcSystem=1, srcComponent=1), []
     with listening(switch_source=True) as listener, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:

@@ -99,6 +99,11 @@ class OdometryHeading:
         self._points.clear()
         self._fit, self.confirmed = None, False
 
+    def start(self, known: OdomYaw | None) -> None:
+        """Take a yaw that an earlier run knew; None: nothing."""
+        if known is not None:
+            self.odom_yaw, self.confirmed = known, True
+
     def add(self, stamp_ns: int, xyz_map_m: Array64, variance_m2: float, xyz_odom_m: Array64, segment: int) -> None:
         """A LiDAR position (map) and the autopilot's position then; variance of one horizontal axis."""
         if segment != self._segment:

@@ -152,6 +152,29 @@ def test_after_a_kill_grd_starts_anew_and_the_flight_goes_on() -> None:
     assert not stack_of(simulation).quadrotor.crashed
 
 
+@pytest.mark.parametrize(
+    ("config", "flight", "killed_s"),
+    [("sim_flight_inertial_fixes", "hover_yaw_fixes", (14.0, 15.0)), ("sim_flight_fixes", "hover_fixes", (9.0, 10.0))],
+)
+def test_after_a_kill_with_a_state_file_poses_are_sent_again_within_5_s(
+    config: str, flight: str, killed_s: tuple[float, float], tmp_path: Path
+) -> None:
+    """The autopilot's estimate is not independent any more; the heading is that of the run before."""
+    state = f"links: {{autopilot: {{config: {{state_file: {tmp_path / 'sent.json'}}}}}}}"
+    (tmp_path / "config.yaml").write_text(f"include: {ROOT / 'configs' / config}.yaml\n{state}\n", encoding="utf-8")
+    plan = [{"do": "path", "for_s": killed_s[0] - 1}, {"do": "use_sources", "set": 2}, {"do": "hold", "for_s": 40}]
+    scenario = changed(
+        load_scenario(ROOT / "configs/scenarios/flight" / f"{flight}.yaml"), killed_s[1] + 4, {"plan": plan}
+    )
+    scenario = scenario.changed(closed_loop={"killed_s": killed_s})
+    loop = load_loop(tmp_path / "config.yaml", scenario.rig_yaml(), "test", scenario.closed_loop)
+    records, start_ns = list(Simulation(scenario, loop=loop).records()), scenario.start_ns
+    sent = messages(records, "/autopilot/tx", "ODOMETRY")
+    after_s = [(r.arrival_ns - start_ns) * 1e-9 for r, _ in sent if r.arrival_ns == r.stamp_ns]
+    assert max(s for s in after_s if s < killed_s[1]) == pytest.approx(killed_s[0], abs=0.1)
+    assert min(s for s in after_s if s > killed_s[1]) - killed_s[0] < 5.0
+
+
 def test_the_command_writes_the_flight_and_says_what_became_of_it(tmp_path: Path) -> None:
     report = simulate(FLIGHT, tmp_path / "flight.mcap", closed_loop=CONFIG, duration_s=1.0)
     assert "flight: flown to the end; no pose sent" in str(report)

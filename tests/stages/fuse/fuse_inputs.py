@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -14,7 +14,7 @@ from stages.messages import BranchState, DroneFix, RelativePose, RelativeRotatio
 from tests.stages.fuse.imu_flights import ns
 
 Event = tuple[int, str, Any]  # arrival [ns], port, message
-Fault = Callable[[list[Event]], list[Event]]
+Fault = Callable[[list[Event]], Iterable[Event]]
 
 
 def fix(t, xyz, sigma=0.06, track_id=1, velocity=None, bias_covariance_m2=None) -> DroneFix:
@@ -54,6 +54,13 @@ def poses_of(stage, events: list[Event]) -> list[RelativePose]:
     """Poses that the stage publishes over these events."""
     made = (m for _, port, message in events for m in getattr(stage, f"on_{port}")(message))
     return [m for m in made if isinstance(m, RelativePose)]
+
+
+def clocked(events: list[Event]) -> list[Event]:
+    """These events with the servo's messages, 100 a second."""
+    first, last = events[0][0], events[-1][0]
+    states = [servo((at_ns - ns(0.0)) * 1e-9) for at_ns in range(first, last, 10_000_000)]
+    return sorted([*events, *((m.stamp_ns, "servo", m) for m in states)], key=lambda e: e[0])
 
 
 # faults

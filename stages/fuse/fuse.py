@@ -52,6 +52,7 @@ from stages.messages import (
 
 GRID_NS = 20_000_000
 HEADING_NS = 200_000_000  # between two HeadingEstimates
+LEAST_PUBLISHED = 1e-4  # probability of a hypothesis
 Poses = Iterator[RelativePose | HeadingEstimate]
 
 
@@ -224,11 +225,10 @@ def _hypotheses(estimator: Estimator) -> tuple[Array64, Array64, Array64, float]
     if estimator.graph.running:
         state: InertialState = estimator.graph.state
         return state.yaw_rad, np.sqrt(state.yaw_variance_rad2), np.ones(1), 1.0
-    bank, factor = estimator.heading.bank, estimator.heading.log_factor()
-    if bank is None:
+    if estimator.heading.bank is None:
         return none, none, none, 0.0
-    weight = bank.weight if factor is None else bank.weight * np.exp(factor)
-    weight = weight / weight.sum()
-    order = np.argsort(-weight, kind="stable")
-    sigma = np.sqrt(bank.state.yaw_variance_rad2)
-    return bank.state.yaw_rad[order], sigma[order], weight[order], estimator.heading.near_probability
+    yaws = estimator.heading.yaws()
+    order = np.argsort(-yaws.weight, kind="stable")
+    order = order[yaws.weight[order] > LEAST_PUBLISHED]
+    sigma = np.sqrt(yaws.variance_rad2[order])
+    return yaws.yaw_rad[order], sigma, yaws.weight[order], estimator.heading.near_probability

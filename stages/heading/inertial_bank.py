@@ -17,6 +17,7 @@ model), and PDA, 3.4 of Bar-Shalom and Li (1995), with one measurement; split: F
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,6 +47,24 @@ ALIKE = 1.0  # squared distance of the yaws over their variances below which two
 ALIKE_RAD = math.radians(3.0)
 NEAR_RAD = math.radians(20.0)
 LEAST_CANDIDATE = 0.05  # a less probable hypothesis is not the best one
+
+
+@dataclass(frozen=True)
+class YawMixture:
+    """Normal densities of a yaw."""
+
+    yaw_rad: Array64  # (n,)
+    variance_rad2: Array64  # (n,)
+    weight: Array64  # (n,) sums to 1
+
+    def best(self) -> tuple[int, float]:
+        """Index of the part with the most probability within 20 deg, and that probability."""
+        sigma = np.sqrt(self.variance_rad2)
+        near = np.zeros(len(sigma))
+        for i in np.flatnonzero(self.weight > LEAST_CANDIDATE):
+            near[i] = _within(self.yaw_rad - self.yaw_rad[i], sigma, NEAR_RAD) @ self.weight
+        best = int(np.argmax(near))
+        return best, float(near[best])
 
 
 class InertialBank:
@@ -137,19 +156,10 @@ class InertialBank:
         self.log_weight = np.append(self.log_weight[rest], log_weight)
         return True
 
-    def near_probability(self, log_factor: Array64 | None = None) -> tuple[int, float]:
-        """Index of the most probable hypothesis, and the probability of a yaw within 20 deg of it.
-
-        `log_factor` (n,): evidence in addition to the weights.
-        """
-        log_weight = self.log_weight if log_factor is None else self.log_weight + log_factor
-        weight = np.exp(log_weight - _log_sum(log_weight))
-        yaw, sigma = self.state.yaw_rad, np.sqrt(self.state.yaw_variance_rad2)
-        near = np.zeros(len(yaw))
-        for i in np.flatnonzero(weight > LEAST_CANDIDATE):
-            near[i] = _within(yaw - yaw[i], sigma, NEAR_RAD) @ weight
-        best = int(np.argmax(near))
-        return best, float(near[best])
+    @property
+    def yaws(self) -> YawMixture:
+        """The yaw of each hypothesis."""
+        return YawMixture(self.state.yaw_rad, self.state.yaw_variance_rad2, self.weight)
 
     def mean(self) -> InertialState:
         """One hypothesis with the moments of all: valid for position and velocity, not for the rotation."""

@@ -18,7 +18,7 @@ import numpy as np
 from stages.geometry.frames import Array64
 from stages.heading import bank_measurements as measure
 from stages.heading.imu_buffer import ImuBuffer
-from stages.heading.inertial_bank import NEAR_RAD, InertialBank, start
+from stages.heading.inertial_bank import NEAR_RAD, InertialBank, YawMixture, start
 from stages.heading.inertial_state import POSITION, ImuIntervals, InertialState
 from stages.heading.odometry_heading import YawEvidence
 from stages.kernels.geometry.so3 import log_rotation
@@ -94,7 +94,7 @@ class InertialHeading:
         inlier = measure.add_position(self.bank, xyz_m, covariance_m2)
         self.position_evidence = self.bank.log_evidence
         self.bank.tidy()
-        self.near_probability = self.bank.near_probability(self.log_factor())[1]
+        self.near_probability = self.yaws().best()[1]
         self._decisions = self._decisions + 1 if self.near_probability > DECIDED else 0
         return inlier
 
@@ -143,11 +143,10 @@ class InertialHeading:
         """(6,) mean biases."""
         return np.zeros(6) if self.bank is None else self.bank.weight @ self.bank.state.bias
 
-    def log_factor(self) -> Array64 | None:
-        """(n,) evidence of the autopilot's odometry, which is not part of the weights: its error is constant."""
-        if self.bank is None or self.evidence is None:
-            return None
-        return self.evidence.log_density(self.bank.state.yaw_rad, self.bank.state.yaw_variance_rad2)
+    def yaws(self) -> YawMixture:
+        """The yaw with the evidence of the autopilot's odometry, which is not in the bank: its error is constant."""
+        assert self.bank is not None
+        return self.bank.yaws if self.evidence is None else self.evidence.applied(self.bank.yaws)
 
     @property
     def decided(self) -> bool:
@@ -160,10 +159,9 @@ class InertialHeading:
         The odometry's yaw is evidence for the decision alone: the error of its compass must not reach the estimate.
         """
         assert self.bank is not None
-        bank, factor = self.bank, self.log_factor()
-        best, _ = bank.near_probability(factor)
-        yaw = bank.state.yaw_rad
-        near = np.flatnonzero(np.abs(np.remainder(yaw - yaw[best] + math.pi, 2 * math.pi) - math.pi) <= 1.5 * NEAR_RAD)
+        bank, yaws = self.bank, self.yaws()
+        off = bank.state.yaw_rad - yaws.yaw_rad[yaws.best()[0]]
+        near = np.flatnonzero(np.abs(np.remainder(off + math.pi, 2 * math.pi) - math.pi) <= 1.5 * NEAR_RAD)
         return InertialBank(bank.state.rows(near), bank.log_weight[near]).mean()
 
     def _late_s(self, stamp_ns: int) -> float | None:

@@ -21,6 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stages.geometry.frames import Array64, heading_rad
+from stages.heading.inertial_bank import YawMixture
 
 APART_NS = 150_000_000
 WINDOW_NS = 10_000_000_000
@@ -59,12 +60,19 @@ class YawEvidence:
     sigma_rad: float
     outlier_share: float
 
-    def log_density(self, yaw_rad: Array64, variance_rad2: Array64) -> Array64:
-        """(n,) logarithm of the density for normal yaws, relative to a uniform one."""
-        s2 = self.sigma_rad**2 + variance_rad2
-        off = np.remainder(yaw_rad - self.yaw_rad + math.pi, 2 * math.pi) - math.pi
-        inlier = np.exp(-0.5 * off**2 / s2) * np.sqrt(2 * math.pi / s2)
-        return np.log((1.0 - self.outlier_share) * inlier + self.outlier_share)
+    def applied(self, prior: YawMixture) -> YawMixture:
+        """A mixture with this evidence: each part as if the compass were right, and as if it were wrong."""
+        s2 = self.sigma_rad**2 + prior.variance_rad2
+        off = np.remainder(self.yaw_rad - prior.yaw_rad + math.pi, 2 * math.pi) - math.pi
+        density = np.exp(-0.5 * off**2 / s2) * np.sqrt(2 * math.pi / s2)  # relative to a uniform one
+        gain = prior.variance_rad2 / s2
+        weight = np.concatenate([(1.0 - self.outlier_share) * density, np.full(len(off), self.outlier_share)])
+        weight *= np.tile(prior.weight, 2)
+        return YawMixture(
+            np.concatenate([prior.yaw_rad + gain * off, prior.yaw_rad]),
+            np.concatenate([(1.0 - gain) * prior.variance_rad2, prior.variance_rad2]),
+            weight / weight.sum(),
+        )
 
 
 class OdometryHeading:

@@ -226,7 +226,9 @@ class Estimator:
         if fix.bias_covariance_m2 is not None:
             bias = fix.bias_covariance_m2
             whole = bias + e.fix_variance * (fix.covariance_m2 - bias)
-        R, ahead = R_map_vehicle, self._vehicle.extrapolation_covariance_m2(fix.stamp_ns, fix.xyz_vehicle_m)
+        R, ahead = R_map_vehicle, np.zeros((3, 3))
+        if self._vehicle.known_at(fix.stamp_ns):  # otherwise the vehicle frame serves as the map frame
+            ahead = self._vehicle.extrapolation_covariance_m2(fix.stamp_ns, fix.xyz_vehicle_m)
         return FixCovariance(R @ (whole - bias + ahead) @ R.T, R @ bias @ R.T)
 
     def _use_fix(self, fix: DroneFix) -> None:

@@ -11,8 +11,10 @@ import numpy as np
 from stages.fuse import Fuse
 from stages.kernels.geometry.so3 import log_rotation
 from stages.messages import HeadingEstimate, PoseEstimate, RelativePose
+from tests.stages.fuse.fuse_inputs import Fault
 from tests.stages.fuse.imu_flights import ImuFlight, seconds
 
+MAP, VEHICLE = "map", "vehicle"  # frames of the errors
 CHI2_95 = 7.815  # 3 degrees of freedom
 DECIDED_WRONG_DEG = 20.0
 HEADER = (
@@ -40,48 +42,53 @@ class Flown:
     headings: list[HeadingEstimate] = field(default_factory=list)
 
 
-def fly(flight: ImuFlight, stage: Fuse | None = None) -> Flown:
-    """Run a flight through the stage."""
+def fly(flight: ImuFlight, stage: Fuse | None = None, fault: Fault = list, frame: str = MAP) -> Flown:
+    """Run a flight through the stage, its inputs with a fault; errors are in a frame."""
     stage, out = stage or Fuse(), Flown()
-    began = time.thread_time()
-    events = flight.events()
+    events = fault(flight.events())
     began = time.thread_time()
     for _, port, message in events:
         for made in getattr(stage, f"on_{port}")(message):
             (out.headings if isinstance(made, HeadingEstimate) else out.poses).append(made)
     out.cpu_ms = 1e3 * (time.thread_time() - began) / flight.until_s
     for heading in out.headings:
-        _add_heading(out, flight, heading)
+        _add_heading(out, flight, heading, frame)
     for pose in out.poses:
         if 0.0 <= seconds(pose.stamp_ns) < flight.until_s and pose.estimate is not None:
-            _add_pose(out, flight, pose)
+            _add_pose(out, flight, pose, frame)
     return out
 
 
-def _add_heading(out: Flown, flight: ImuFlight, heading: HeadingEstimate) -> None:
+def _add_heading(out: Flown, flight: ImuFlight, heading: HeadingEstimate, frame: str) -> None:
     t = seconds(heading.stamp_ns)
     if not heading.decided or t >= flight.until_s:
         return
     out.decided_s = min(out.decided_s, t - flight.first_fix_s)
-    R = flight.truth(t)[0]
+    R, yaw_rad = flight.truth(t)[0], heading.yaw_map_rad[0]
+    if frame == VEHICLE:
+        R, yaw_rad = flight.vehicle(t)[0].T @ R, yaw_rad - heading.vehicle_yaw_rad
     yaw = math.atan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1])
-    out.wrong += abs(math.degrees(math.remainder(heading.yaw_map_rad[0] - yaw, 2 * math.pi))) > DECIDED_WRONG_DEG
+    out.wrong += abs(math.degrees(math.remainder(yaw_rad - yaw, 2 * math.pi))) > DECIDED_WRONG_DEG
 
 
-def _add_pose(out: Flown, flight: ImuFlight, pose: RelativePose) -> None:
+def _add_pose(out: Flown, flight: ImuFlight, pose: RelativePose, frame: str) -> None:
     t, estimate = seconds(pose.stamp_ns), pose.estimate
     R, xyz_m, _ = flight.truth(t)
-    off = estimate.xyz_map_m - xyz_m
-    full = isinstance(estimate, PoseEstimate)
+    own_m, full = estimate.xyz_map_m, isinstance(estimate, PoseEstimate)
+    if frame == VEHICLE:
+        R_map_vehicle, t_map_vehicle = flight.vehicle(t)
+        R, xyz_m, own_m = R_map_vehicle.T @ R, R_map_vehicle.T @ (xyz_m - t_map_vehicle), estimate.xyz_vehicle_m
+    off = own_m - xyz_m
     if full:
-        R_own, P = estimate.R_map_drone, estimate.map_covariance
+        R_own = estimate.R_vehicle_drone if frame == VEHICLE else estimate.R_map_drone
+        P = estimate.covariance if frame == VEHICLE else estimate.map_covariance
         position_m2 = R_own @ P[3:, 3:] @ R_own.T
         turn = log_rotation(R_own.T @ R)
         out.yaw_deg.append(math.degrees(float(R_own[2] @ turn)))
         out.yaw_sigma_deg.append(math.degrees(math.sqrt(float(R_own[2] @ P[:3, :3] @ R_own[2]))))
         out.nees_rotation.append(float(turn @ np.linalg.solve(P[:3, :3], turn)))
     else:
-        position_m2 = estimate.covariance_map_m2
+        position_m2 = estimate.covariance_vehicle_m2 if frame == VEHICLE else estimate.covariance_map_m2
     out.at_s.append(t)
     out.full.append(full)
     out.error_m.append(float(np.linalg.norm(off)))

@@ -9,12 +9,16 @@ Source: ours.
 
 from __future__ import annotations
 
+from pathlib import Path as FilePath
+
 from flow.graph import Graph
 from flow.link import Record, Tap
 from flow.message import Message
 from flow.replay import Replay
 from links.mavlink import Autopilot
 from links.mavlink.autopilot_session import WAKE_S
+from links.mavlink.poses.independence import POSES
+from links.mavlink.transport.framing import parse_frame
 from stages.messages import RelativePose
 
 TICK_NS = round(1e9 * WAKE_S)
@@ -53,6 +57,8 @@ class PoseTap(Tap):
 
     def __init__(self) -> None:
         super().__init__()
+        self.first_ns: dict[bool, int] = {}
+        """Arrival of the first pose without and with a rotation."""
         self._output: str | None = None
         self._link: Autopilot | None = None
 
@@ -67,13 +73,20 @@ class PoseTap(Tap):
     def see(self, output: str, message: Message, arrival_ns: int) -> None:
         """Pass on a pose."""
         if self._link is not None and output == self._output and isinstance(message, RelativePose):
+            if message.estimate is not None:
+                self.first_ns.setdefault(message.R_vehicle_drone is not None, arrival_ns)
             self._link.on_pose(message)
 
 
 class PoseLoop:
     """The session of a graph's Autopilot link in virtual time."""
 
-    def __init__(self, replay: Replay, graph: Graph, tap: PoseTap, compute_ns: int) -> None:
+    def __init__(
+        self, replay: Replay, graph: Graph, tap: PoseTap, compute_ns: int, state_file: FilePath | None = None
+    ) -> None:
+        """`state_file`: what an earlier run has kept about sent poses (`links.mavlink.poses.sent_state`)."""
+        self.newest_pose: Record | None = None
+        """The newest frame with a pose that was sent."""
         self._now_ns = 0
         self._compute_ns = compute_ns
         self._next_tick_ns: int | None = None
@@ -81,6 +94,8 @@ class PoseLoop:
         link = replay.nodes[name]
         assert isinstance(link, Autopilot)
         self._link, self._topic = link, link.topic
+        if state_file is not None:
+            link.settings = link.settings.model_copy(update={"state_file": state_file})
         if output is not None:
             tap.watch(output, link)
 
@@ -101,7 +116,11 @@ class PoseLoop:
 
     def sent(self) -> list[Record]:
         """Records of what was sent since the last call."""
-        return list(self._session.sent()) if self._next_tick_ns is not None else []
+        records = list(self._session.sent()) if self._next_tick_ns is not None else []
+        for record in records:
+            if parse_frame(record.data).get_type() in POSES:
+                self.newest_pose = record
+        return records
 
 
 def has_autopilot(graph: Graph) -> bool:

@@ -6,6 +6,7 @@ Source: ours.
 from __future__ import annotations
 
 import datetime
+from collections.abc import Sequence
 from pathlib import Path as FilePath
 from typing import Any, Literal, Self
 
@@ -181,9 +182,12 @@ class Scenario(_ScenarioSettings):
         return yaml.safe_dump(rig | ({"cameras": cameras} if cameras else {}), sort_keys=False)
 
 
-def load_scenario(path: FilePath) -> Scenario:
-    """Load a scenario file with its includes. ConfigError lists all problems with file and line."""
-    tree = load_tree(path)
+def load_scenario(path: FilePath, sets: Sequence[str] = ()) -> Scenario:
+    """Load a scenario file with its includes and changed settings (`autopilot.imu_hz=25`).
+
+    ConfigError lists all problems with file and line.
+    """
+    tree = load_tree(path, sets=sets)
     values = resolve(tree, (), tree.values)
     if not tree.errors:
         try:

@@ -25,6 +25,7 @@ from links.simulated.rig.closed_loop import ClosedLoop, load_loop
 from links.simulated.rig.fix_sensor import FixSensor
 from links.simulated.rig.flight_in_the_loop import FlightInTheLoop
 from links.simulated.rig.image_cache import CachedCamera, ImageCache, scenario_world
+from links.simulated.rig.rotation_sensor import RotationSensor
 from links.simulated.rig.scenario import Scenario, load_scenario
 from links.simulated.rig.scripted_servo import ServoScript
 from links.simulated.rig.truth_records import TruthRecords
@@ -93,7 +94,7 @@ class Simulation:
         drone = scenario.drone
         start_ns, duration_s = scenario.start_ns, scenario.duration_s
         drone_motion: Path | Flight | FlownMotion | None = drone.path if drone else None
-        self.telemetry_sources: list[Autopilot | FlightStack | VehicleOdometry] = []
+        self.telemetry_sources: list[Autopilot | FlightStack | VehicleOdometry | RotationSensor] = []
         self.flight: FlightInTheLoop | None = None
         vehicle = scenario.vehicle
         vehicle_motion: Path | SuspendedPath = vehicle.path
@@ -131,6 +132,8 @@ class Simulation:
             self.flight.watch(self._scene.world, self.truth)
         fixes = scenario.fix_sensor
         self._fixes = None if fixes is None else FixSensor(fixes, self.truth, scenario.lidar_gaps_s, self.seed)
+        if scenario.rotation_sensor is not None:
+            self.telemetry_sources.append(RotationSensor(scenario.rotation_sensor, self.truth, self.seed))
         self._lidar = Lidar(scenario.lidar, scenario.start_ns, self.seed, scenario.weather)
         script = scenario.script if loop is None else ()
         commander = ServoScript(script, self.drone_servo_rad if drone else None, self.seed)

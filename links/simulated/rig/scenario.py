@@ -19,6 +19,7 @@ from flow.config_error import ConfigError, did_you_mean
 from links.simulated.autopilot.autopilot import AutopilotSettings
 from links.simulated.rig.closed_loop import ClosedLoopSettings
 from links.simulated.rig.fix_sensor import FixSensorSettings
+from links.simulated.rig.rotation_sensor import RotationSensorSettings
 from links.simulated.rig.scripted_servo import Segment, VibrateSegment
 from links.simulated.sensors.camera import CamerasSettings, rig_cameras
 from links.simulated.sensors.lidar import LidarSettings
@@ -91,6 +92,7 @@ class Scenario(_ScenarioSettings):
     closed_loop: ClosedLoopSettings = ClosedLoopSettings()  # replaces the script with --closed-loop
     lidar_gaps_s: tuple[tuple[float, float], ...] = ()  # (from, to): no packet of the LiDAR arrives
     fix_sensor: FixSensorSettings | None = None  # instead of LiDAR and servo: fast, for graphs with SimulatedFixes
+    rotation_sensor: RotationSensorSettings | None = None  # instead of cameras, for graphs with SimulatedRotations
     truth_visible: bool = False  # write /truth/visible: the LiDAR's line of sight to each drone
     rig: RigLidar = RigLidar()  # the rig file attached to the recording
     true_mount: LidarMount | None = None  # the true mount of the LiDAR, if it differs from the rig file

@@ -78,7 +78,7 @@ class VehicleOdometry:
 
     def T_map_vehicle(self, stamp_ns: NDArray[np.int64]) -> tuple[Array64, Array64]:
         """Poses with the drift, but not frozen, at times (n,): rotations (n, 3, 3), positions (n, 3) [m]."""
-        return self._poses((stamp_ns - self._start_ns) * 1e-9)
+        return self._poses(((stamp_ns - self._start_ns) * 1e-9).astype(np.float64))
 
     def drift_m(self, time_s: float) -> Array64:
         """Error of the position at a time, world axes, when the map's origin and axes are known (3,) [m]."""

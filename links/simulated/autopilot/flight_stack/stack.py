@@ -86,7 +86,7 @@ class FlightStack:
         self.quadrotor = Quadrotor(s, home, float(yaw), ground_m, duration_s, seed)
         self.motion = self.quadrotor.motion
         self._sensors = Sensors(s, seed)
-        self.ekf = Estimators(s, self._true_yaw() + self._sensors.yaw_bias_rad, self.quadrotor, seed)
+        self.ekf = Estimators(s, self._true_yaw() + self._sensors.yaw_bias_rad, seed)
         self._drift_m = drift_m or (lambda time_s: np.zeros(3))
         self._guidance = Guidance(path, vehicle, FlightTarget(np.zeros(3), yaw_rad=self._true_yaw()), self._drift_m)
         self._controller, self._check = PositionController(), EkfCheck()

@@ -279,7 +279,6 @@ class AutopilotSession:
     def _run(self) -> None:
         while not self._closed.wait(WAKE_S):
             self.tick()
-            self._sent_state.write()
             if self._signer is not None:
                 self._signer.write_timestamp()
 
@@ -312,6 +311,7 @@ class AutopilotSession:
                 if request is not None and not self._send(request):
                     self.intervals.on_not_sent()
             self._send_texts(now_ns)
+        self._sent_state.write()
 
     def _send_texts(self, now_ns: int) -> None:
         """Send the text that is due. The lock is held."""

@@ -28,7 +28,6 @@ from flow.replay import Replay, RunReport
 from flow.taps import Digest
 from links.dynamixel import Servo
 from links.dynamixel.servo import NOT_LIVE, GoalCommand
-from links.mavlink.poses.sent_state import SentState
 from links.runs.request import RunRequest
 from links.simulated.rig.pose_loop import PoseLoop, PoseTap, has_autopilot
 from links.simulated.sensors.servo import STEP_NS
@@ -79,13 +78,11 @@ class ClosedLoop:
         self._start_ns: int | None = None
         self._running = True
         self._folder = TemporaryDirectory(prefix="grd-") if settings.killed_s is not None else None
-        self._poses: PoseLoop | None = None
         self._start()
 
     def _start(self) -> None:
         """Build the graph's nodes, and, with an autopilot in the loop, open its session."""
         graph, goals, poses = self._graph, GoalTap(), PoseTap()
-        state_file = self._kept_state()
         self._replay = Replay(graph, (self._digest, goals, poses, *self._taps))
         self._servo: Servo | None = None
         if any(issubclass(spec.cls, Lidar | Servo) for spec in graph.nodes.values()):
@@ -96,17 +93,8 @@ class ClosedLoop:
             goals.watch(output, servo)
         connected = self._start_ns is not None and has_autopilot(graph)
         self._pose_tap = poses
+        state_file = None if self._folder is None else FilePath(self._folder.name) / "sent.json"
         self._poses = PoseLoop(self._replay, graph, poses, self._compute_ns, state_file) if connected else None
-
-    def _kept_state(self) -> FilePath | None:
-        """The file in which the killed run has noted its newest pose, as a run in the field does every second."""
-        newest = None if self._poses is None else self._poses.newest_pose
-        if self._folder is None or newest is None:
-            return None
-        state = SentState(FilePath(self._folder.name) / "sent.json", newest.arrival_ns)
-        state.on_sent(newest.data, newest.arrival_ns)
-        state.write()
-        return FilePath(self._folder.name) / "sent.json"
 
     def connect_autopilot(self, start_ns: int) -> None:
         """The autopilot of a scenario that starts at a time flies on what the graph sends: open its session."""

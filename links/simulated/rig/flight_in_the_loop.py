@@ -64,6 +64,8 @@ class FlightInTheLoop:
         """Frames that the host has sent since the last call; they go to the autopilot."""
         frames = [] if self._loop is None else self._loop.sent()
         for frame in frames:
+            if frame.stamp_ns != frame.arrival_ns:
+                continue  # of an earlier run: recorded again, not sent
             self.stack.receive(frame.data, frame.arrival_ns)
             if self._outcome is not None:
                 self._outcome.on_sent(frame)

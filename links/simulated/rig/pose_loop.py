@@ -17,8 +17,6 @@ from flow.message import Message
 from flow.replay import Replay
 from links.mavlink import Autopilot
 from links.mavlink.autopilot_session import WAKE_S
-from links.mavlink.poses.independence import POSES
-from links.mavlink.transport.framing import parse_frame
 from stages.messages import RelativePose
 
 TICK_NS = round(1e9 * WAKE_S)
@@ -84,9 +82,7 @@ class PoseLoop:
     def __init__(
         self, replay: Replay, graph: Graph, tap: PoseTap, compute_ns: int, state_file: FilePath | None = None
     ) -> None:
-        """`state_file`: what an earlier run has kept about sent poses (`links.mavlink.poses.sent_state`)."""
-        self.newest_pose: Record | None = None
-        """The newest frame with a pose that was sent."""
+        """`state_file`: where runs that follow each other keep what was sent, unless the link has such a file."""
         self._now_ns = 0
         self._compute_ns = compute_ns
         self._next_tick_ns: int | None = None
@@ -94,7 +90,7 @@ class PoseLoop:
         link = replay.nodes[name]
         assert isinstance(link, Autopilot)
         self._link, self._topic = link, link.topic
-        if state_file is not None:
+        if state_file is not None and link.settings.state_file is None:
             link.settings = link.settings.model_copy(update={"state_file": state_file})
         if output is not None:
             tap.watch(output, link)
@@ -116,11 +112,7 @@ class PoseLoop:
 
     def sent(self) -> list[Record]:
         """Records of what was sent since the last call."""
-        records = list(self._session.sent()) if self._next_tick_ns is not None else []
-        for record in records:
-            if parse_frame(record.data).get_type() in POSES:
-                self.newest_pose = record
-        return records
+        return list(self._session.sent()) if self._next_tick_ns is not None else []
 
 
 def has_autopilot(graph: Graph) -> bool:

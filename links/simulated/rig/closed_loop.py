@@ -188,7 +188,9 @@ def loop_metadata(config: FilePath, graph: Graph) -> dict[str, str]:
     }
 
 
-def load_loop(config: FilePath, rig_yaml: str, scenario: str, settings: ClosedLoopSettings) -> ClosedLoop:
+def load_loop(
+    config: FilePath, rig_yaml: str, scenario: str, settings: ClosedLoopSettings, taps: Sequence[Tap] = ()
+) -> ClosedLoop:
     """A configuration as a closed loop on the rig of a scenario. ConfigError has all problems of the configuration."""
     graph = RunRequest(config).graph(rig_yaml, scenario)
-    return ClosedLoop(graph, settings, loop_metadata(config, graph))
+    return ClosedLoop(graph, settings, loop_metadata(config, graph), taps)

@@ -20,7 +20,7 @@ from flow.taps import Digest
 from links.mavlink.transport.framing import parse_frame
 from links.simulated.autopilot.flight_stack.stack import FlightStack
 from links.simulated.rig import closed_loop
-from links.simulated.rig.closed_loop import ClosedLoop
+from links.simulated.rig.closed_loop import load_loop
 from links.simulated.rig.run import Simulation, simulate
 from links.simulated.rig.scenario import Scenario, load_scenario
 from stages.messages import DroneLocalPosition
@@ -56,8 +56,7 @@ class Positions(Tap):
 
 
 def fly(scenario: Scenario, *taps: Tap) -> tuple[list[Record], Simulation, str]:
-    rig = yaml.safe_load(scenario.rig_yaml()), Location("test", 0)
-    loop = ClosedLoop(load_graph(CONFIG, sections={"rig": rig}), scenario.closed_loop, {}, taps)
+    loop = load_loop(CONFIG, scenario.rig_yaml(), "test", scenario.closed_loop, taps)
     simulation = Simulation(scenario, loop=loop)
     return list(simulation.records()), simulation, loop.output_hash
 

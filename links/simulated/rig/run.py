@@ -21,11 +21,11 @@ from links.simulated.autopilot.autopilot import Autopilot
 from links.simulated.autopilot.flight_stack.outcome import Outcome
 from links.simulated.autopilot.flight_stack.stack import FlightStack
 from links.simulated.kernels.lidar import lidar_poses
+from links.simulated.pose_sensors.fix_sensor import FixSensor
+from links.simulated.pose_sensors.rotation_sensor import RotationSensor
 from links.simulated.rig.closed_loop import ClosedLoop, load_loop
-from links.simulated.rig.fix_sensor import FixSensor
 from links.simulated.rig.flight_in_the_loop import FlightInTheLoop
 from links.simulated.rig.image_cache import CachedCamera, ImageCache, scenario_world
-from links.simulated.rig.rotation_sensor import RotationSensor
 from links.simulated.rig.scenario import Scenario, load_scenario
 from links.simulated.rig.scripted_servo import ServoScript
 from links.simulated.rig.truth_records import TruthRecords

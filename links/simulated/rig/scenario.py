@@ -17,9 +17,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from flow.config.tree import load_tree, resolve
 from flow.config_error import ConfigError, did_you_mean
 from links.simulated.autopilot.autopilot import AutopilotSettings
+from links.simulated.pose_sensors.fix_sensor import FixSensorSettings
+from links.simulated.pose_sensors.rotation_sensor import RotationSensorSettings
 from links.simulated.rig.closed_loop import ClosedLoopSettings
-from links.simulated.rig.fix_sensor import FixSensorSettings
-from links.simulated.rig.rotation_sensor import RotationSensorSettings
 from links.simulated.rig.scripted_servo import Segment, VibrateSegment
 from links.simulated.sensors.camera import CamerasSettings, rig_cameras
 from links.simulated.sensors.lidar import LidarSettings

@@ -20,7 +20,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from flow.link import Record
-from links.simulated.rig.fix_source import FIX_TOPIC
+from links.simulated.pose_sensors.pose_source import FIX_TOPIC
 from links.simulated.world.scene import Truth
 
 NS = 1_000_000_000

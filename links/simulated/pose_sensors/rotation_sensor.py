@@ -21,7 +21,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from flow.link import Record
-from links.simulated.rig.fix_source import ROTATION_TOPIC
+from links.simulated.pose_sensors.pose_source import ROTATION_TOPIC
 from links.simulated.world.motion import rotations_from_vectors
 from links.simulated.world.scene import Truth
 from stages.geometry.frames import Array64, rotation_z

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from links.simulated import SimulatedRotations
-from links.simulated.rig.rotation_sensor import RotationSensor, RotationSensorSettings
+from links.simulated.pose_sensors.rotation_sensor import RotationSensor, RotationSensorSettings
 from links.simulated.world.path import Path, Waypoint
 from links.simulated.world.scene import Truth
 from stages.geometry.frames import rotation_z

@@ -117,6 +117,13 @@ def replay_recording(
             "and compare the output hash.",
         ),
     ] = False,
+    trust: Annotated[
+        bool,
+        typer.Option(
+            "--trust",
+            help="With --as-live: the recording is your own, so import its own stages and run its taps.",
+        ),
+    ] = False,
     single_process: Annotated[
         bool,
         typer.Option(
@@ -136,6 +143,7 @@ def replay_recording(
     The first part of a split recording stands for all parts; a later part is replayed alone. --expect takes a whole
     output hash or its first 16 digits: those cover the values, the rest covers the reason texts. With --as-live each
     stage gets the inputs of the live run in the same order; exit code 1 when the hash differs from that of the run.
+    The configuration in a recording is data: it may use the stages and links of grd only, and writes to --out only.
 
     Example: grd replay recordings/street_sweep.mcap --out out/mine
     """
@@ -144,7 +152,7 @@ def replay_recording(
             raise LinkError(
                 "--as-live takes the recording's own configuration: leave out --config, --overlay and --set"
             )
-        output_hash = _rerun(recording, out_dir, view)
+        output_hash = _rerun(recording, out_dir, view, trust)
     else:
         chosen = config or DEFAULT_REPLAY_CONFIG
         output_hash = _run(recording, chosen, out_dir, overlay or [], sets or [], view, single_process).output_hash
@@ -172,10 +180,10 @@ def _run(
     return result
 
 
-def _rerun(recording: Path, out_dir: Path | None, view: bool) -> str:
+def _rerun(recording: Path, out_dir: Path | None, view: bool, trusted: bool) -> str:
     folder = _new_folder(out_dir, f"{recording.stem}-as-live")
     with progress_bar(f"replay {recording.name} as live") as step:
-        rerun = rerun_into(folder, recording, step)
+        rerun = rerun_into(folder, recording, step, trusted=trusted)
     _print_result(rerun.result)
     out.print(rerun.comparison)
     if view:

@@ -10,6 +10,7 @@ from dataclasses import asdict
 from importlib.metadata import version
 from typing import Any
 
+from flow.config.secrets import without_secrets
 from flow.live.report import LiveReport
 from links.runs.request import RunRequest, RunResult
 from links.runs.results import stamp_s
@@ -26,7 +27,7 @@ def summary(run: RunResult, request: RunRequest) -> dict[str, Any]:
         **({"parts": run.parts} if run.parts is not None and run.parts > 1 else {}),
         "config": request.config.name,
         "overlays": [path.name for path in request.overlays],
-        "set": list(request.sets),
+        "set": [without_secrets(text) for text in request.sets],
         "output_hash": run.output_hash,
         "records": report.records,
         "start_s": stamp_s(report.first_ns),

@@ -43,7 +43,7 @@ _log = logging.getLogger("grd.viewer")
 class ViewerSettings(Settings):
     """Settings of `Viewer`."""
 
-    file: str | None = "run.rrd"  # in the folder of the run; null: no file
+    file: str | None = Field("run.rrd", pattern=r"^[\w.-]+\.rrd$")  # in the folder of the run; null: no file
     serve: bool = False  # serve viewers on this host; binds 127.0.0.1 only
     port: int = Field(9876, ge=1024, le=65535)
     memory_limit: str = Field(

@@ -1,6 +1,7 @@
 """Configuration files as one tree that keeps where each value was written.
 
-- `include:` composes files: included files come first, the including file on top.
+- `include:` composes files: included files come first, the including file on top. A file is looked for next to the
+  including one, then among those that come with the program.
 - Overlay files and `--set track.radius_m=0.8` change values.
 - `$rig.lidar.mount` is replaced by another value of the tree. `$rig.cameras.drone.readout_ms or 0` is 0 where the tree
   has no such value.
@@ -30,6 +31,7 @@ from flow.config.yaml_text import (
 )
 from flow.config_error import ConfigError, ErrorDetail, Location, did_you_mean
 
+SHIPPED = Path(__file__).resolve().parents[2] / "configs"  # the configurations that come with the program
 Section = tuple[str, str]  # YAML text, and where it is from, for errors
 
 
@@ -166,6 +168,8 @@ def _read(file: Path, tree: Tree, including: tuple[Path, ...]) -> Tree:
             tree.errors.append(ErrorDetail(location, "include", text))
             continue
         target = file.parent / name
+        if not target.is_file() and (SHIPPED / name).is_file():
+            target = SHIPPED / name
         chain = (*including, file.resolve())
         if target.resolve() in chain:
             tree.errors.append(ErrorDetail(location, "include", f"'{name}' includes itself."))

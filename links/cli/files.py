@@ -113,6 +113,8 @@ def view(
         typer.Option("--screenshot", help="Write an image instead of opening a window (no display needed)."),
     ] = None,
     at: Annotated[float, typer.Option("--at", min=0, max=1, help="Time of the image, as a fraction of the run.")] = 0.9,
+    tab: Annotated[str | None, typer.Option("--tab", help="Tab in the image [default: Overview].")] = None,
+    size: Annotated[str, typer.Option("--size", metavar="WxH", help="Size of the image [px].")] = "1920x1080",
 ) -> None:
     """Open a run in the Rerun viewer, or write a screenshot of it.
 
@@ -125,7 +127,7 @@ def view(
     if png is None:
         show(rrd)
         return
-    errors = screenshot(rrd, png, at=at)
+    errors = screenshot(rrd, png, at=at, tab=tab, size=size)
     for text in errors:
         err.print(text, markup=False, style="red")
     out.print(f"wrote {png}", markup=False)

@@ -16,6 +16,7 @@ from links.cli.console import out, show_table, warn
 from links.clock import Clock
 from links.runs.request import RunResult
 from links.runs.results import FIX_FILE, POSE_FILE, SUMMARY_FILE, stamp_s
+from stages.messages import PoseState
 
 TABLE_ROWS = 12
 
@@ -112,7 +113,8 @@ def nothing_found(graph: Graph, result: RunResult, report: LiveReport, config: P
     sensors = [name for name in report.links if graph.nodes[name].cls is not Clock]
     silent = [name for name in sensors if not report.links[name].records]
     searched = not result.stage_outputs
-    if not (sensors and silent == sensors) and (not searched or result.results.fixes):
+    found = result.results.fixes or result.results.pose_states.keys() - {PoseState.LOST.name}
+    if not (sensors and silent == sensors) and (not searched or found):
         return []
     head = "no sensor sent anything" if silent == sensors else "no drone was found: no position was measured"
     why = {name: report.statuses.get(name) or report.links[name].reason or "no record came" for name in silent}

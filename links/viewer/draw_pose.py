@@ -142,8 +142,8 @@ def gate(message: RelativePose, name: str, gate: Gate, scene: ViewerScene) -> En
 def truth(number: int, stamp_ns: int, xyz_m: Array64) -> Entities:
     """The true position of a drone: a ghost in 3D and curves."""
     ghost = rr.Points3D([xyz_m], colors=TRUTH_COLOUR, radii=0.25, labels=["truth"], show_labels=False)
-    yield Entity(f"vehicle/truth/drone_{number}", ghost, frame="vehicle")
-    yield plot(f"plots/position/truth/drone_{number}", xyz_m, [f"true {axis}" for axis in AXES], TRUE_AXES, dots=False)
+    yield Entity(f"vehicle/true_drone_{number}", ghost, frame="vehicle")
+    yield plot(f"plots/position/true_drone_{number}", xyz_m, [f"true {axis}" for axis in AXES], TRUE_AXES, dots=False)
 
 
 def errors_against(truths: Sequence[TrueTrack], scene: ViewerScene) -> Iterator[tuple[int, Entity]]:

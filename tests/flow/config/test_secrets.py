@@ -54,7 +54,7 @@ def test_no_file_of_a_live_run_holds_the_camera_s_password(tmp_path, monkeypatch
     monkeypatch.chdir(tmp_path)
     Path("secret.yaml").write_text(CONFIG)
     source = f"camera.source=rtsp://crew:{PASSWORD}@127.0.0.1:9/other"
-    printed = command.grd("run", "secret.yaml", "--for", 1.5, "--no-warm-up", "--set", source, "--out", "out")
+    printed = command.grd("run", "secret.yaml", "--for", 1.5, "--no-warm-up", "--set", source, "--out", "out", code=1)
     assert PASSWORD not in printed
     assert json.loads(Path("out/summary.json").read_text())["set"] == ["camera.source=rtsp://***@127.0.0.1:9/other"]
     with RecordingReader("out/flight.mcap") as reader:

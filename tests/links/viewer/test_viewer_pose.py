@@ -181,7 +181,7 @@ def test_the_truth_and_the_errors_are_in_the_file_of_a_replay(tmp_path):
     viewer.close()
     assert viewer.errors == {}
     paths = {chunk.entity_path for chunk in RrdReader(tmp_path / "run.rrd").stream().to_chunks()}
-    assert {"/vehicle/truth/drone_1", "/plots/position/truth/drone_1", f"/plots/error/{NAME}"} <= paths
+    assert {"/vehicle/true_drone_1", "/plots/position/true_drone_1", f"/plots/error/{NAME}"} <= paths
 
 
 def test_each_tab_has_its_own_views_and_only_those_that_the_graph_fills():

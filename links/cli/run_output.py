@@ -16,7 +16,7 @@ from links.cli.console import out, show_table, warn
 from links.clock import Clock
 from links.runs.request import RunResult
 from links.runs.results import FIX_FILE, POSE_FILE, SUMMARY_FILE, stamp_s
-from links.zenoh.receiver import Receiver
+from links.zenoh import Receiver, Sender
 from stages.messages import PoseState
 
 TABLE_ROWS = 12
@@ -111,7 +111,7 @@ def _fix_table(run: RunResult) -> Table:
 
 def nothing_found(graph: Graph, result: RunResult, report: LiveReport, config: Path) -> list[str]:
     """Why a live run was of no use, and what to do; empty when it found a drone, or searched for none."""
-    sensors = [name for name in report.links if graph.nodes[name].cls not in (Clock, Receiver)]
+    sensors = [name for name in report.links if not issubclass(graph.nodes[name].cls, (Clock, Receiver, Sender))]
     silent = [name for name in sensors if not report.links[name].records]
     searched = not result.stage_outputs
     found = result.results.fixes or result.results.pose_states.keys() - {PoseState.LOST.name}

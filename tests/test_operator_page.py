@@ -108,7 +108,7 @@ TEXTS = {  # source file and its texts
     "links/viewer/viewer.py": ["not all is drawn", "not drawn"],
     "links/zenoh/connection.py": ["does not accept the connection", "has not replied for"],
     "links/zenoh/sender.py": ["does not subscribe to"],
-    "links/cli/run.py": ["rejected: "],
+    "links/cli/run_output.py": ["rejected: "],
 }
 
 

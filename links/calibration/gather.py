@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from flow.config.yaml_text import YamlTextError, yaml_values
 from flow.link import LinkError, Record
 from links.dynamixel import Servo
 from links.dynamixel.servo import TICK_RAD
@@ -138,9 +138,9 @@ def returns_of(packets: Iterable[LidarFirings], step: int) -> Returns:
 def checked_rig(text: str, where: str) -> tuple[dict[str, object], LidarMount]:
     """A rig file's tree and its LiDAR's mount. LinkError says what is wrong with it."""
     try:
-        rig = yaml.safe_load(text)
+        rig = yaml_values(text)
         return rig, LidarMount.model_validate(rig["lidar"]["mount"])
-    except (yaml.YAMLError, KeyError, TypeError) as error:
+    except (YamlTextError, KeyError, TypeError) as error:
         raise LinkError(f"{where}: the rig cannot be read: {str(error).splitlines()[0]}") from None
     except ValidationError as errors:
         first = errors.errors(include_url=False)[0]

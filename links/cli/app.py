@@ -5,9 +5,13 @@ Source: ours.
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import typer
 
+from links import __version__
 from links.cli.calibrate import calibrate_recording
+from links.cli.console import out
 from links.cli.evaluate import evaluate_runs
 from links.cli.files import import_recording, recover_recording, view
 from links.cli.flights import fly_scenarios
@@ -22,7 +26,6 @@ app = typer.Typer(
     name="grd",
     help="Pose of a drone relative to a moving ground vehicle: run live, replay, check, simulate, evaluate.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
@@ -42,6 +45,21 @@ app.command("calibrate")(calibrate_recording)
 app.command("lens")(import_lens)
 app.command("evaluate")(evaluate_runs)
 app.command("verify")(verify)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        out.print(f"grd {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    del version
 
 
 def main() -> None:

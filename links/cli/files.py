@@ -12,6 +12,7 @@ import typer
 import yaml
 from pydantic import ValidationError
 
+from flow.config.yaml_text import YamlTextError, yaml_values
 from flow.link import LinkError
 from links.cli.console import EXIT_FAILED, err, out, progress_bar, report_errors, warn
 from stages.geometry.frames import LidarMount
@@ -62,9 +63,9 @@ def read_rig(file: Path) -> str:
     with file.open("rb") as stream:
         data = stream.read(MAX_RIG_BYTES + 1)
     try:
-        tree = yaml.safe_load(data.decode("utf-8")) if len(data) <= MAX_RIG_BYTES else None
-    except (UnicodeDecodeError, yaml.YAMLError) as error:
-        raise LinkError(f"{file} is no rig: {str(error).splitlines()[0]}") from None
+        tree = yaml_values(data) if len(data) <= MAX_RIG_BYTES else None
+    except YamlTextError as error:
+        raise LinkError(f"{file} is no rig: {error}") from None
     rig = tree.get("rig", tree) if isinstance(tree, dict) else None
     if not isinstance(rig, dict) or "lidar" not in rig:
         raise LinkError(f"{file} is no rig: it needs 'lidar:' with 'mount:' as configs/rigs/standard.yaml has")
@@ -112,6 +113,8 @@ def view(
         typer.Option("--screenshot", help="Write an image instead of opening a window (no display needed)."),
     ] = None,
     at: Annotated[float, typer.Option("--at", min=0, max=1, help="Time of the image, as a fraction of the run.")] = 0.9,
+    tab: Annotated[str | None, typer.Option("--tab", help="Tab in the image [default: Overview].")] = None,
+    size: Annotated[str, typer.Option("--size", metavar="WxH", help="Size of the image [px].")] = "1920x1080",
 ) -> None:
     """Open a run in the Rerun viewer, or write a screenshot of it.
 
@@ -124,7 +127,7 @@ def view(
     if png is None:
         show(rrd)
         return
-    errors = screenshot(rrd, png, at=at)
+    errors = screenshot(rrd, png, at=at, tab=tab, size=size)
     for text in errors:
         err.print(text, markup=False, style="red")
     out.print(f"wrote {png}", markup=False)

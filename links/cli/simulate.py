@@ -13,6 +13,7 @@ import typer
 from flow.link import LinkError
 from links.cli.console import EXIT_FAILED, EXIT_USAGE, err, out, progress_bar, report_errors, warn
 from links.cli.files import Overwrite
+from links.runs.shipped import shipped, shipped_option
 
 if TYPE_CHECKING:  # the simulator is an optional dependency
     from links.simulated.matrix.flights import Cell
@@ -20,13 +21,18 @@ if TYPE_CHECKING:  # the simulator is an optional dependency
 
 ClosedLoop = Annotated[
     Path | None,
-    typer.Option("--closed-loop", metavar="CONFIG", help="Configuration whose pipeline commands the servo."),
+    typer.Option(
+        "--closed-loop",
+        metavar="CONFIG",
+        callback=shipped_option,
+        help="Configuration whose pipeline commands the servo.",
+    ),
 ]
 
 
 @report_errors
 def simulate_recording(
-    scenario: Annotated[Path, typer.Argument(help="Scenario file, as in configs/scenarios/.")],
+    scenario: Annotated[Path, typer.Argument(callback=shipped, help="Scenario file, as in configs/scenarios/.")],
     out_file: Annotated[Path, typer.Option("--out", "-o", help="Recording to write.")],
     seed: Annotated[
         int | None, typer.Option("--seed", help="Seed of scene and noise [default: the scenario's].")

@@ -225,12 +225,12 @@ class _TelemetryLog(_ImportedFile):
     """The MAVLink frames of a telemetry log."""
 
     def __init__(self, stream: IO[bytes], source: Path) -> None:
-        self._data = stream.read()
+        self._stream = stream
         self._source = source
         self._report = TlogReport()
 
     def records(self) -> Iterator[Record]:
-        for time_ns, frame in read_frames(self._data, self._source, self._report):
+        for time_ns, frame in read_frames(self._stream, self._source, self._report):
             yield Record(_AUTOPILOT, time_ns, time_ns, frame)
 
     def done_bytes(self) -> int:
@@ -243,4 +243,4 @@ class _TelemetryLog(_ImportedFile):
         return self._report.warnings
 
     def nothing_found(self) -> str:
-        return f"{self._source}: no MAVLink frame in {len(self._data)} bytes: is it a telemetry log (.tlog)?"
+        return f"{self._source}: no MAVLink frame in {self._report.done_bytes} bytes: is it a telemetry log (.tlog)?"

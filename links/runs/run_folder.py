@@ -31,6 +31,8 @@ from links.runs.summary import summary
 from links.runs.truth import TruthLog, read_truth_file
 from links.runs.usage import Usage
 from links.velodyne import Lidar, recorded_lidars
+from links.viewer import Viewer
+from links.viewer.scene import Gate
 from stages.messages import Detections, DroneFix, RelativePose
 
 CONFIG_FILE = "config.yaml"
@@ -57,9 +59,13 @@ class RunFolder:
         self._folder, self._recording, self._request, self._graph = folder, recording, request, graph
         self._live = live
         self._started_s = time.monotonic() if started_s is None else started_s
-        self._results, self._open = Results(**_gate(graph)), ExitStack()
+        gate = _gate(graph)
+        self._results, self._open = Results(**gate), ExitStack()
         declared = [spec.build() for spec in graph.nodes.values() if issubclass(spec.cls, Tap)]
         self.taps: list[Tap] = [self._results, *(tap for tap in declared if isinstance(tap, Tap))]
+        self._viewers = [tap for tap in self.taps if isinstance(tap, Viewer)]
+        for viewer in self._viewers:
+            viewer.gate = Gate(**gate) if gate else None
 
     def __enter__(self) -> RunFolder:
         self._folder.mkdir(parents=True, exist_ok=True)
@@ -106,6 +112,9 @@ class RunFolder:
         warnings = [*warnings, *_remarks(self._graph, report)]
         for text in (*warnings, f"output hash {output_hash}"):
             self.note(text)
+        if truth is not None:
+            for viewer in self._viewers:
+                viewer.truths = [truth.drone_in_vehicle(number) for number in sorted(truth.drones)]
         self._open.close()
         if truth is None:
             truth = read_truth_file(self._recording)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Any, cast
 
-import yaml
+from flow.config.yaml_text import YamlTextError, yaml_values
 
 USE = "links.velodyne.Lidar"
 
@@ -15,8 +15,8 @@ USE = "links.velodyne.Lidar"
 def recorded_lidars(config_yaml: str | None) -> list[dict[str, Any]]:
     """The `config` of each LiDAR node, as written; empty where the recording holds no readable configuration."""
     try:
-        tree = yaml.safe_load(config_yaml or "")
-    except yaml.YAMLError:
+        tree = yaml_values(config_yaml or "")
+    except YamlTextError:
         return []
     links = tree.get("links") if isinstance(tree, dict) else None
     nodes = cast("dict[str, Any]", links).values() if isinstance(links, dict) else ()

@@ -13,6 +13,8 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from links.mavlink.poses.gate import PoseLimits
+from links.mavlink.profiles import YawOutput
 from links.viewer import colours
 from links.viewer.entities import Entities, Entity, stage_of
 from links.viewer.lenses import Cameras
@@ -24,6 +26,7 @@ DRONE_FRAME = "drone_position"  # axes of the vehicle, origin at the latest fix;
 FAN_RADIUS_M = 12.0
 SPHERE_SPACING = 2.8  # distance of the unit spheres of vehicle and drone [radii]
 NEAR_DRONE_M = 1.0
+MAX_ESTIMATES = 200_000  # of an output: an hour at 50 Hz
 TURNTABLE_PERIOD_NS = 20_000_000
 HYPOTHESIS_TIMEOUT_NS = 150_000_000  # a tracker reports each hypothesis ten times a second
 STATE_TIMEOUT_NS = 1_000_000_000
@@ -37,6 +40,21 @@ class LastCandidate(NamedTuple):
     probability: float
     seen_ns: int
     reason: str
+
+
+class Gate(NamedTuple):
+    """The autopilot link's gate: which poses it sends."""
+
+    limits: PoseLimits
+    yaw: YawOutput
+
+
+class Estimate(NamedTuple):
+    """An estimated position of the drone."""
+
+    stamp_ns: int
+    xyz_vehicle_m: Array64  # (3,)
+    sigma_m: float  # one sigma, 3D
 
 
 class LoggedImage(NamedTuple):
@@ -65,11 +83,15 @@ class ViewerScene:
         trail_s: float,
         cameras: Cameras | None = None,
         image_period_s: float = 0.0,
+        gate: Gate | None = None,
     ):
+        """`gate`: of the autopilot link; None: nothing is sent to an autopilot."""
         self.mount = mount
         self.cameras = cameras or Cameras()
         self.images: dict[str, LoggedImage] = {}  # by frame id, the last one logged
         self._image_period_ns = int(image_period_s * 1e9)
+        self.gate = gate
+        self.estimates: dict[str, deque[Estimate]] = {}  # by output, for the errors against the truth
         self.max_points = max_points
         self.trail_s = trail_s
         self.slice_ns = int(slice_s * 1e9)
@@ -90,6 +112,20 @@ class ViewerScene:
             return False
         self._last_values[path] = value
         return True
+
+    def estimated(self, name: str, stamp_ns: int, xyz_vehicle_m: Array64, covariance_m2: Array64) -> None:
+        """Store an estimated position of the drone of an output."""
+        estimates = self.estimates.setdefault(name, deque(maxlen=MAX_ESTIMATES))
+        estimates.append(Estimate(stamp_ns, xyz_vehicle_m, math.sqrt(float(covariance_m2.trace()))))
+
+    def followed(self, xyz_m: Array64) -> NDArray[np.bool_]:
+        """Mask (n,) of the points (n, 3) within 1 m of a drone or of a hypothesis that the tracker follows."""
+        near = self.near_a_drone(xyz_m)
+        for hypotheses in self._hypotheses.values():
+            for track in hypotheses:
+                if track.xyz_vehicle_m is not None:
+                    near |= np.linalg.norm(xyz_m - track.xyz_vehicle_m, axis=1) < NEAR_DRONE_M
+        return near
 
     def has_value(self, path: str) -> bool:
         """Whether a value is stored under `path`."""

@@ -162,7 +162,7 @@ def test_a_truncated_recording_is_replayed_to_its_end_with_a_warning(grd, tmp_pa
 
 def test_a_configuration_without_a_recording_runs_live_and_reports_missing_devices(grd, tmp_path):
     overlay = without_viewer(tmp_path)
-    text = grd("run", ROOT / "configs" / "paper.yaml", "--for", 0.3, "--no-warm-up", "--overlay", overlay)
+    text = grd("run", ROOT / "configs" / "paper.yaml", "--for", 0.3, "--no-warm-up", "--overlay", overlay, code=1)
     assert "no links.recording.Recorder is configured: nothing is recorded" in text
     assert "no drone: no sweep was completed" in text
 

@@ -146,8 +146,9 @@ def test_camera_views_exist_only_when_the_graph_has_their_outputs():
     everything = Vision(["camera_drone"], directions=True, rotation=True, odometry=True)
     added = names(everything) - without
     assert "camera drone" in added
-    assert len(added) == 7
+    assert len(added) == 8, "seven views, and the tab"
     assert names(Vision(rotation=True)) - without == {
+        "Rotation",
         "Yaw branch probabilities [%]",
         "Rotation of the drone in the vehicle frame [deg]",
         "Sigma of the rotation [deg]",

@@ -265,14 +265,18 @@ def _merge_mapping(base: Tree, top: Tree, path: KeyPath, below: dict[str, Any], 
 
 
 def _set(tree: Tree, text: str) -> None:
-    """Apply `track.radius_m=0.8`: a stage's or link's name and a setting, or a whole path (`rig.drone.span_m=0.35`)."""
+    """Apply `track.radius_m=0.8`: a stage's or link's name and a setting, or a whole path (`rig.drone.span_m=0.35`).
+
+    In a file without stages and links, such as a scenario, every key is a whole path.
+    """
     location = Location(f"--set {text}", 0)
     key, equals, raw = text.partition("=")
     parts = tuple(key.strip().split("."))
-    if not equals or len(parts) < 2 or not all(parts):
+    of_graph = bool(tree.values.keys() & {"stages", "links"})
+    if not equals or len(parts) < 1 + of_graph or not all(parts):
         tree.error((), "must read NAME.SETTING=VALUE, as in --set track.radius_m=0.8.", location)
         return
-    if parts[0] not in ("stages", "links", "rig"):
+    if of_graph and parts[0] not in ("stages", "links", "rig"):
         kinds = [kind for kind in ("stages", "links") if parts[0] in (tree.values.get(kind) or {})]
         if not kinds:
             names: list[str] = [*(tree.values.get("stages") or {}), *(tree.values.get("links") or {}), "rig"]

@@ -10,6 +10,7 @@ import typer
 from links.cli.calibrate import calibrate_recording
 from links.cli.evaluate import evaluate_runs
 from links.cli.files import import_recording, recover_recording, view
+from links.cli.flights import fly_scenarios
 from links.cli.graphs import check, graph, schema
 from links.cli.lens import import_lens
 from links.cli.preflight import preflight
@@ -34,6 +35,7 @@ app.command("import")(import_recording)
 app.command("recover")(recover_recording)
 app.command("simulate")(simulate_recording)
 app.command("matrix")(simulate_matrix)
+app.command("flights")(fly_scenarios)
 app.command("view")(view)
 app.command("preflight")(preflight)
 app.command("calibrate")(calibrate_recording)

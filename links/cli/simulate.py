@@ -45,6 +45,10 @@ def simulate_recording(
             "servo, radio and CONFIG may differ; settings that affect the images may not.",
         ),
     ] = None,
+    sets: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Change a setting of SCENARIO, as in autopilot.imu_hz=25."),
+    ] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Make a recording of a simulated flight.
@@ -69,6 +73,7 @@ def simulate_recording(
             closed_loop=closed_loop,
             duration_s=duration_s,
             images=images,
+            sets=sets or (),
         )
     out.print(str(report), markup=False)
 

@@ -25,6 +25,7 @@ from stages.geometry.se3 import mahalanobis2
 from stages.geometry.trajectory import VehicleTrajectory
 from stages.heading import bank_measurements as measure
 from stages.heading.autopilot_samples import AutopilotSamples
+from stages.heading.earlier_run import EarlierRun
 from stages.heading.heading_memory import HeadingMemory
 from stages.heading.imu_buffer import ImuBuffer
 from stages.heading.inertial_bank import InertialBank
@@ -65,6 +66,7 @@ class Estimator:
         self.odometry = OdometryHeading(math.radians(errors.compass_deg), errors.compass_outliers)
         self._autopilot = AutopilotSamples()
         self._memory = HeadingMemory(self.imu)
+        self.earlier = EarlierRun(errors.changed_frames)
         self._waiting: list[tuple[int, int, Measurement]] = []
         self._count = 0
         self.resets, self.too_late = 0, 0
@@ -236,8 +238,12 @@ class Estimator:
         R_map_vehicle, t = self._vehicle.at(stamp_ns)
         z, covariance = R_map_vehicle @ fix.xyz_vehicle_m + t, self.fix_covariance(fix, R_map_vehicle)
         self.newest_fix_ns = max(stamp_ns, self.newest_fix_ns or stamp_ns)
-        if not self.known:
-            self._find(fix, z, covariance)
+        whole_m2 = covariance.white + covariance.bias
+        if self.odometry.odom_yaw is None:
+            self.odometry.start(self.earlier.odom_yaw(stamp_ns, z, whole_m2))
+        earlier = self.earlier.heading(stamp_ns, z, whole_m2, self.known and self.decided)
+        if not self.known or earlier is not None:
+            self._find(fix, z, covariance, earlier)
             return
         late_s = max(self.stamp_ns - stamp_ns, 0) * 1e-9
         if late_s > 0.5:
@@ -304,15 +310,17 @@ class Estimator:
         if self.graph.running:
             self.heading.stop()
 
-    def _find(self, fix: DroneFix, z: Array64, covariance: FixCovariance) -> None:
-        """Start at a LiDAR position."""
+    def _find(
+        self, fix: DroneFix, z: Array64, covariance: FixCovariance, earlier: tuple[float, float, float] | None = None
+    ) -> None:
+        """Start at a LiDAR position; `earlier`: yaw of an earlier run, its sigma and the probability that it holds."""
         velocity = fix.velocity_vehicle_mps
         if velocity is not None:
             velocity = self._vehicle.to_map(fix.stamp_ns, fix.xyz_vehicle_m, velocity)[1]
         up = self._autopilot.up_drone(fix.stamp_ns)
         self._restart_filters()
         self.odometry.on_found()
-        memory = self._memory.yaw(fix.stamp_ns, z, covariance.white + covariance.bias)
+        memory = earlier or self._memory.yaw(fix.stamp_ns, z, covariance.white + covariance.bias)
         level = np.array([0.0, 0.0, 1.0]) if up is None else up
         self.heading.start(fix.stamp_ns, z, covariance.white + covariance.bias, velocity, level, memory)
         self.fix_ns, self.bias_covariance_m2 = fix.stamp_ns, covariance.bias

@@ -40,6 +40,7 @@ from stages.messages import (
     DroneFix,
     DroneMotion,
     HeadingEstimate,
+    HeadingPrior,
     PoseState,
     RelativePose,
     RelativeRotation,
@@ -70,7 +71,7 @@ class Fuse(Stage[FuseSettings]):
     """Pose of the drone by IMU and LiDAR, with its state."""
 
     optional_inputs: ClassVar[frozenset[str]] = frozenset(
-        {"rotation", "motion", "drone_motion", "visual_motion", "track", "servo", "tick"}
+        {"rotation", "motion", "drone_motion", "visual_motion", "prior", "track", "servo", "tick"}
     )
 
     def __init__(self, settings: FuseSettings | None = None, /, **values: Any) -> None:
@@ -108,6 +109,13 @@ class Fuse(Stage[FuseSettings]):
         if self._intake.is_valid(motion, "drone motion", *numbers, *more) and self._map_frame.is_fixed(motion.stamp_ns):
             self._estimator.add_motion(motion)
         yield from self._publish(motion)
+
+    def on_prior(self, prior: HeadingPrior) -> Poses:
+        """Heading that an earlier run of grd knew."""
+        numbers = np.array([prior.yaw_map_rad, prior.yaw_map_odom_rad, prior.sigma_rad, prior.position_sigma_m])
+        if self._intake.is_valid(prior, "heading prior", prior.xyz_map_m, numbers):
+            self._estimator.earlier.prior = prior
+        yield from self._publish(prior)
 
     def on_visual_motion(self, motion: VisualMotion) -> Poses:
         """Visual odometry of the drone: turns, and directions without scale."""

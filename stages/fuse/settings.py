@@ -26,6 +26,7 @@ class FuseErrors(BaseModel):
     rotation_bias_share: float = Field(default=0.2, ge=0, lt=1)
     compass_deg: float = Field(default=7.0, gt=0)  # of the autopilot's yaw
     compass_outliers: float = Field(default=0.03, gt=0, lt=1)  # share of autopilots whose yaw is wrong by any angle
+    changed_frames: float = Field(default=0.05, gt=0, lt=1)  # share of restarts while the autopilot changes its frame
 
 
 class FuseLimits(BaseModel):

@@ -3,9 +3,10 @@
     z_i = c + Rz(psi) x_i + e_i
 
 z: LiDAR positions (map), x: the autopilot's positions (odom): psi is the yaw of `odom` in `map`, known within metres
-of flight. The body's yaw is psi plus the yaw of R_odom_drone, less the error of the autopilot's compass: its velocity
-by GPS is right while its attitude may be turned. No motion of the odometry alone shows that error, so it stays an
-uncertainty however long the drone flies:
+of flight. A fit with a scale, a = |a| exp(i psi), shows the error of the odometry: it is as large across a as along
+it, where a is 1. The body's yaw is psi plus the yaw of R_odom_drone, less the error of the autopilot's compass: its
+velocity by GPS is right while its attitude may be turned. No motion of the odometry alone shows that error, so it stays
+an uncertainty however long the drone flies:
 
     p(yaw) = (1 - o) N(yaw; psi + yaw_odom, sigma_psi^2 + sigma_c^2) + o / 2 pi
 
@@ -28,6 +29,7 @@ WINDOW_NS = 10_000_000_000
 LEAST_POINTS, LEAST_M = 4, 1.0
 FIX_FLOOR_M = 0.05
 DRIFT_MPS = 0.12  # error of the odometry's velocity, constant over the window, one axis
+WANDER_M, WANDER_S = 0.1, 2.0  # of its position, by the noise of GPS, one axis, and time constant
 WORST_CHI2 = 3.0  # of the fit, for each degree of freedom
 LENGTH_SLACK = 0.35  # displacements that differ more are not of one motion
 CURRENT_NS = 3_000_000_000
@@ -97,6 +99,11 @@ class OdometryHeading:
         self._points.clear()
         self._fit, self.confirmed = None, False
 
+    def start(self, known: OdomYaw | None) -> None:
+        """Take a yaw that an earlier run knew; None: nothing."""
+        if known is not None:
+            self.odom_yaw, self.confirmed = known, True
+
     def add(self, stamp_ns: int, xyz_map_m: Array64, variance_m2: float, xyz_odom_m: Array64, segment: int) -> None:
         """A LiDAR position (map) and the autopilot's position then; variance of one horizontal axis."""
         if segment != self._segment:
@@ -137,7 +144,8 @@ class OdometryHeading:
         t = np.array([p[0] - points[0][0] for p in points]) * 1e-9
         z, x = np.array([p[1] for p in points]), np.array([p[3] for p in points])
         variance = np.array([p[2] for p in points]) + FIX_FLOOR_M**2
-        inverse = np.linalg.inv(np.diag(variance) + DRIFT_MPS**2 * np.outer(t, t))
+        wander = WANDER_M**2 * np.exp(-np.abs(t[:, None] - t) / WANDER_S)
+        inverse = np.linalg.inv(np.diag(variance) + wander + DRIFT_MPS**2 * np.outer(t, t))
         ones = inverse.sum(axis=1)
         W = inverse - np.outer(ones, ones) / ones.sum()
         Wx = W @ x
@@ -150,4 +158,5 @@ class OdometryHeading:
         chi2 = float(np.vdot(left, W @ left).real)
         if abs(abs(a) - 1.0) > LENGTH_SLACK or chi2 > WORST_CHI2 * 2 * (len(points) - 2):
             return None
-        return OdomYaw(stamp_ns, math.atan2(a.imag, a.real), 1.0 / math.sqrt(precision))
+        sigma = max(1.0 / math.sqrt(precision), abs(abs(a) - 1.0))  # the error of a, seen along it, is as large across
+        return OdomYaw(stamp_ns, math.atan2(a.imag, a.real), sigma)

@@ -14,13 +14,13 @@ Ekf::controlEvPosFusion (LOCAL_FRAME_NED, LOCAL_FRAME_FRD), Ekf::controlEvYawFus
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from links.mavlink.ned_frd import R_odom_drone_from_rpy, flip_yz, upper_from_pose_covariance, wxyz_from_R_odom_drone
 from links.mavlink.poses.gate import PoseLimits
+from links.mavlink.poses.own_estimate import OwnAttitude
 from links.mavlink.poses.pose_messages import BODY_FRD, LOCAL_FRD, UNKNOWN, UNKNOWN_COVARIANCE, VIO
 from links.mavlink.poses.position_gate import odom_position, position_quality_percent
 from links.mavlink.transport.framing import SEQUENCE, dialect
@@ -29,16 +29,6 @@ from stages.messages import RelativePose
 LOCAL_NED = 1  # MAV_FRAME
 TILT_RAD2 = math.radians(2.0) ** 2  # of the autopilot's own roll and pitch
 NO_YAW_RAD2 = math.pi**2  # of a yaw that is not measured
-
-
-@dataclass(frozen=True, slots=True)
-class OwnAttitude:
-    """The autopilot's attitude as it reported it: NED, FRD."""
-
-    roll_rad: float
-    pitch_rad: float
-    yaw_rad: float
-    arrival_ns: int
 
 
 def position_odometry(

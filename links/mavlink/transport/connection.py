@@ -65,7 +65,7 @@ class Connection(Protocol):
     reconnects: int
     foreign: int  # datagrams from other senders, ignored
     stalls: int  # how often it was closed because it was blocked
-    left_late: int  # frames that were sent more than LATE_NS late, as far as is known
+    left_late: int  # frames that were sent more than MAX_LATENCY_NS late, as far as is known
 
     @property
     def status(self) -> str | None:

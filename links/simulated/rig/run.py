@@ -21,8 +21,9 @@ from links.simulated.autopilot.autopilot import Autopilot
 from links.simulated.autopilot.flight_stack.outcome import Outcome
 from links.simulated.autopilot.flight_stack.stack import FlightStack
 from links.simulated.kernels.lidar import lidar_poses
+from links.simulated.pose_sensors.fix_sensor import FixSensor
+from links.simulated.pose_sensors.rotation_sensor import RotationSensor
 from links.simulated.rig.closed_loop import ClosedLoop, load_loop
-from links.simulated.rig.fix_sensor import FixSensor
 from links.simulated.rig.flight_in_the_loop import FlightInTheLoop
 from links.simulated.rig.image_cache import CachedCamera, ImageCache, scenario_world
 from links.simulated.rig.scenario import Scenario, load_scenario
@@ -80,32 +81,36 @@ class Simulation:
         seed: int | None = None,
         loop: ClosedLoop | None = None,
         images: ImageCache | None = None,
+        *,
+        record_truth: bool = True,
     ) -> None:
         """With a `loop` its pipeline commands the servo, and the scenario's script is not used.
 
         With `images`, a recording of the same flight, the cameras are not rendered.
         """
-        self._loop = loop
+        self._loop, self._record_truth = loop, record_truth
         self.scenario = scenario if seed is None else scenario.changed(seed=seed)
         self.seed = self.scenario.seed
         drone = scenario.drone
         start_ns, duration_s = scenario.start_ns, scenario.duration_s
         drone_motion: Path | Flight | FlownMotion | None = drone.path if drone else None
-        self.telemetry_sources: list[Autopilot | FlightStack | VehicleOdometry] = []
+        self.telemetry_sources: list[Autopilot | FlightStack | VehicleOdometry | RotationSensor] = []
         self.flight: FlightInTheLoop | None = None
+        vehicle = scenario.vehicle
+        vehicle_motion: Path | SuspendedPath = vehicle.path
+        if vehicle.suspension is not None:
+            vehicle_motion = SuspendedPath(vehicle.path, vehicle.suspension, duration_s, self.seed)
+        odometry: VehicleOdometry | None = None
+        if scenario.vehicle_odometry is not None:
+            odometry = VehicleOdometry(scenario.vehicle_odometry, vehicle_motion, start_ns, duration_s, self.seed)
         if drone is not None and scenario.autopilot is not None and scenario.autopilot.flight_stack is not None:
-            self.flight = FlightInTheLoop(self.scenario, loop)
+            self.flight = FlightInTheLoop(self.scenario, loop, odometry)
             drone_motion = self.flight.stack.motion
             self.telemetry_sources.append(self.flight.stack)
         elif drone is not None and scenario.autopilot is not None:
             drone_motion = Flight(drone.path, scenario.autopilot.flight, duration_s, self.seed)
             self.telemetry_sources.append(Autopilot(scenario.autopilot, drone_motion, start_ns, duration_s, self.seed))
-        vehicle = scenario.vehicle
-        vehicle_motion: Path | SuspendedPath = vehicle.path
-        if vehicle.suspension is not None:
-            vehicle_motion = SuspendedPath(vehicle.path, vehicle.suspension, duration_s, self.seed)
-        if scenario.vehicle_odometry is not None:
-            odometry = VehicleOdometry(scenario.vehicle_odometry, vehicle_motion, start_ns, duration_s, self.seed)
+        if odometry is not None:
             self.telemetry_sources.append(odometry)
         others = scenario.other_drones
         self.truth = Truth(start_ns, vehicle_motion, drone_motion, tuple(other.path for other in others))
@@ -127,6 +132,8 @@ class Simulation:
             self.flight.watch(self._scene.world, self.truth)
         fixes = scenario.fix_sensor
         self._fixes = None if fixes is None else FixSensor(fixes, self.truth, scenario.lidar_gaps_s, self.seed)
+        if scenario.rotation_sensor is not None:
+            self.telemetry_sources.append(RotationSensor(scenario.rotation_sensor, self.truth, self.seed))
         self._lidar = Lidar(scenario.lidar, scenario.start_ns, self.seed, scenario.weather)
         script = scenario.script if loop is None else ()
         commander = ServoScript(script, self.drone_servo_rad if drone else None, self.seed)
@@ -201,7 +208,7 @@ class Simulation:
             records += camera.records(next_ns)
         for source in self.telemetry_sources:
             records += source.records(next_ns)
-        return records + self.truth_records(next_ns)
+        return records + (self.truth_records(next_ns) if self._record_truth else [])
 
     def _push(self, records: list[Record]) -> None:
         """Keep records until they arrive, except LiDAR packets in a gap."""
@@ -286,14 +293,18 @@ def simulate(
     closed_loop: FilePath | None = None,
     duration_s: float | None = None,
     images: FilePath | None = None,
+    sets: Sequence[str] = (),
 ) -> SimulationReport:
     """Simulate a scenario file into a recording, in closed loop if a configuration is given.
 
-    `images` is a recording of the same flight whose images are used; the result is the same to the byte. `progress`
-    gets the completed fraction, 0 to 1. Errors are LinkError, and ConfigError for the configuration.
+    `sets` change settings of the scenario (`autopilot.imu_hz=25`). `images` is a recording of the same flight whose
+    images are used; the result is the same to the byte. `progress` gets the completed fraction, 0 to 1. Errors are
+    LinkError, and ConfigError for the configuration.
     """
-    overrides = {"seed": seed, "duration_s": duration_s}
-    loaded = load_scenario(scenario).changed(**{name: value for name, value in overrides.items() if value is not None})
+    given = {"seed": seed, "duration_s": duration_s}
+    loaded = load_scenario(scenario, sets).changed(
+        **{name: value for name, value in given.items() if value is not None}
+    )
     loop = None
     if closed_loop is not None:
         loop = load_loop(closed_loop, loaded.rig_yaml(), f"{loaded.name} (rig)", loaded.closed_loop)

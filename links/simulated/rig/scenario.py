@@ -6,6 +6,7 @@ Source: ours.
 from __future__ import annotations
 
 import datetime
+from collections.abc import Sequence
 from pathlib import Path as FilePath
 from typing import Any, Literal, Self
 
@@ -16,8 +17,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from flow.config.tree import load_tree, resolve
 from flow.config_error import ConfigError, did_you_mean
 from links.simulated.autopilot.autopilot import AutopilotSettings
+from links.simulated.pose_sensors.fix_sensor import FixSensorSettings
+from links.simulated.pose_sensors.rotation_sensor import RotationSensorSettings
 from links.simulated.rig.closed_loop import ClosedLoopSettings
-from links.simulated.rig.fix_sensor import FixSensorSettings
 from links.simulated.rig.scripted_servo import Segment, VibrateSegment
 from links.simulated.sensors.camera import CamerasSettings, rig_cameras
 from links.simulated.sensors.lidar import LidarSettings
@@ -90,6 +92,7 @@ class Scenario(_ScenarioSettings):
     closed_loop: ClosedLoopSettings = ClosedLoopSettings()  # replaces the script with --closed-loop
     lidar_gaps_s: tuple[tuple[float, float], ...] = ()  # (from, to): no packet of the LiDAR arrives
     fix_sensor: FixSensorSettings | None = None  # instead of LiDAR and servo: fast, for graphs with SimulatedFixes
+    rotation_sensor: RotationSensorSettings | None = None  # instead of cameras, for graphs with SimulatedRotations
     truth_visible: bool = False  # write /truth/visible: the LiDAR's line of sight to each drone
     rig: RigLidar = RigLidar()  # the rig file attached to the recording
     true_mount: LidarMount | None = None  # the true mount of the LiDAR, if it differs from the rig file
@@ -181,9 +184,12 @@ class Scenario(_ScenarioSettings):
         return yaml.safe_dump(rig | ({"cameras": cameras} if cameras else {}), sort_keys=False)
 
 
-def load_scenario(path: FilePath) -> Scenario:
-    """Load a scenario file with its includes. ConfigError lists all problems with file and line."""
-    tree = load_tree(path)
+def load_scenario(path: FilePath, sets: Sequence[str] = ()) -> Scenario:
+    """Load a scenario file with its includes and changed settings (`autopilot.imu_hz=25`).
+
+    ConfigError lists all problems with file and line.
+    """
+    tree = load_tree(path, sets=sets)
     values = resolve(tree, (), tree.values)
     if not tree.errors:
         try:

@@ -17,6 +17,7 @@ from links.mavlink.origin import OriginSender
 from links.mavlink.poses.gate import PoseLimits
 from links.mavlink.poses.independence import Independence
 from links.mavlink.poses.pose_sender import PoseSender
+from links.mavlink.source_switch import SourceSwitch
 from links.mavlink.streams.message_intervals import MessageIntervals, MessageRates
 from links.mavlink.transport.connection import Address, Connection
 from links.mavlink.transport.framing import packed, parse_frame
@@ -151,6 +152,7 @@ class SlowFlight:
             pose_sender,
             OriginSender(None, (1, 1)),
             MessageIntervals(NO_REQUESTS, "ardupilot", (1, 1), (1, 197)),
+            SourceSwitch(None, (), (1, 1), (1, 197), pose_sender.texts.warn),
             None,
             lambda: self.now_ns,
             ("/autopilot/rx", "/autopilot/tx"),

@@ -20,7 +20,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from flow.link import Record
-from links.simulated.rig.fix_source import FIX_TOPIC
+from links.simulated.pose_sensors.pose_source import FIX_TOPIC
 from links.simulated.world.scene import Truth
 
 NS = 1_000_000_000
@@ -40,6 +40,7 @@ class FixSensorSettings(BaseModel):
     correlation_s: float = Field(default=0.25, gt=0)
     velocity_mps: float = Field(default=0.1, ge=0)  # one sigma of the reported velocity
     detection: float = Field(default=0.97, gt=0, le=1)  # probability of each fix
+    of_other_s: tuple[float, float] | None = None  # (from, to): the fixes are those of the first other drone
 
 
 class FixSensor:
@@ -80,7 +81,8 @@ class FixSensor:
             return {"coasting": True}
         stamps = np.array([stamp_ns - NS // 50, stamp_ns])
         R, t = self._truth.T_world_vehicle(stamps)
-        relative = np.einsum("nji,nj->ni", R, self._truth.T_world_drone(stamps)[1] - t)
+        number = 2 if s.of_other_s is not None and s.of_other_s[0] <= time_s < s.of_other_s[1] else 1
+        relative = np.einsum("nji,nj->ni", R, self._truth.T_world_drone(stamps, number)[1] - t)
         range_m = float(np.linalg.norm(relative[1]))
         xyz = relative[1] + range_m * (s.bias_per_m * self._bias + s.sigma_per_m * self._error)
         velocity = (relative[1] - relative[0]) * 50 + velocity_error

@@ -1,4 +1,4 @@
-"""The link that reads the fixes of `fix_sensor`: fixes, states of a track, and the host's clock.
+"""The links that read `fix_sensor` (fixes, states of a track, and the host's clock) and `rotation_sensor`.
 
 Source: ours.
 """
@@ -11,9 +11,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from flow.link import Record, Source, SourceSettings
-from stages.messages import DroneFix, Tick, TrackingState, TrackState
+from stages.kernels.geometry.so3 import nearest_rotation
+from stages.messages import BranchState, DroneFix, RelativeRotation, Tick, TrackingState, TrackState
 
-FIX_TOPIC = "/simulated/fixes"
+FIX_TOPIC, ROTATION_TOPIC = "/simulated/fixes", "/simulated/rotations"
 FRAME_S = 0.1
 RETURNS = 5
 
@@ -59,3 +60,26 @@ class SimulatedFixes(Source[SimulatedFixesSettings]):
             bias_covariance_m2=bias,
         )
         yield Tick(stamp_ns=record.arrival_ns)
+
+
+class SimulatedRotationsSettings(SourceSettings):
+    """Settings of `SimulatedRotations`."""
+
+    topic: str = ROTATION_TOPIC
+
+
+class SimulatedRotations(Source[SimulatedRotationsSettings]):
+    """Rotations of a simulated sensor, in place of cameras, vanishing points and align; their branch is not known."""
+
+    def decode(self, record: Record) -> RelativeRotation:
+        """One rotation."""
+        content = json.loads(record.data)
+        return RelativeRotation(
+            stamp_ns=record.stamp_ns,
+            R_vehicle_drone=nearest_rotation(np.array(content["R"])),
+            covariance_rad2=content["sigma_rad"] ** 2 * np.eye(3),
+            branch_probability=np.full(4, 0.25),
+            state=BranchState.AMBIGUOUS,
+            switches=0,
+            reason="simulated rotation",
+        )

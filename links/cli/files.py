@@ -22,14 +22,16 @@ Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existin
 
 @report_errors
 def import_recording(
-    file: Annotated[Path, typer.Argument(help="A VLP-16 capture (.pcap) or a MAVLink log (.tlog).")],
+    file: Annotated[Path, typer.Argument(help="A LiDAR's capture (.pcap) or a MAVLink log (.tlog).")],
     out_file: Annotated[
         Path | None, typer.Option("--out", "-o", help="Recording to write [default: next to FILE].")
     ] = None,
     rig: Annotated[
         Path | None, typer.Option("--rig", help="rig.yaml to attach [default for .pcap: bolted upright].")
     ] = None,
-    port: Annotated[int, typer.Option("--port", help="UDP port of the LiDAR's data packets in the capture.")] = 2368,
+    port: Annotated[
+        int | None, typer.Option("--port", help="UDP port of the LiDAR's data packets [default: the model's].")
+    ] = None,
     sender: Annotated[
         str | None, typer.Option("--sender", help="IPv4 address of the LiDAR, if there are several.")
     ] = None,

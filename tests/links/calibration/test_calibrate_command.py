@@ -135,11 +135,9 @@ def test_a_small_odometry_drift_while_parked_is_decided_by_the_surfaces(tmp_path
 
 
 def test_the_lidars_clock_is_the_recorded_runs():
-    run = (
-        "links: {front: {use: links.velodyne.Lidar, config: {clock: utc, port: 2400}}, cam: {use: links.camera.Camera}}"
-    )
+    run = "links: {front: {use: links.lidar.Lidar, config: {clock: utc, port: 2400}}, cam: {use: links.camera.Camera}}"
     assert lidar_of(run).settings.clock == "utc"
-    for other in (None, "seed: 3", "links: null", "links: {front: {use: links.velodyne.Lidar}}", "- 1"):
+    for other in (None, "seed: 3", "links: null", "links: {front: {use: links.lidar.Lidar}}", "- 1"):
         assert lidar_of(other).settings.clock == "free"
 
 

@@ -24,14 +24,14 @@ from flow.graph import load_graph
 from flow.link import LinkError
 from flow.message import array_fields, check_arrays
 from flow.replay import replay
-from links.velodyne import Lidar
-from links.velodyne.reject_reason import PacketRejectReason
+from links.lidar import Lidar
+from links.lidar.reject_reason import PacketRejectReason
 
 SWEEP = """\
 stages:
   sweep: {use: stages.sweep.Sweep, config: {mount: {turns: false}}, inputs: {firings: lidar.lidar_firings}}
 links:
-  lidar: {use: links.velodyne.Lidar}
+  lidar: {use: links.lidar.Lidar}
 """
 
 

@@ -9,7 +9,7 @@ from typing import Any, cast
 
 import yaml
 
-USE = "links.velodyne.Lidar"
+USE = "links.lidar.Lidar"
 
 
 def recorded_lidars(config_yaml: str | None) -> list[dict[str, Any]]:

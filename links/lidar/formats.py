@@ -10,10 +10,12 @@ import functools
 from links.lidar.hesai import HesaiFormat
 from links.lidar.ouster import OusterFormat
 from links.lidar.packet_format import PacketFormat
+from links.lidar.reject_reason import PacketRejectReason
 from links.lidar.velodyne import VelodyneFormat
 from stages.geometry.lidar_models import LIDAR_MODELS, lidar_profile
 from stages.geometry.rig_lidar import LidarBeams
 
+NOT_THE_MODEL = (PacketRejectReason.LENGTH, PacketRejectReason.POSITION, PacketRejectReason.MODEL)
 AnyFormat = VelodyneFormat | HesaiFormat | OusterFormat
 
 
@@ -30,7 +32,11 @@ def packet_format(model: str, beams: LidarBeams | None = None) -> AnyFormat:
 
 def recognised_model(data: bytes) -> str | None:
     """The model that sent a data packet, where the packet tells it; None for an Ouster's and for anything else."""
-    return next((form.profile.model for form in _same_for_all_units() if form.reject_reason(data) is None), None)
+    for form in _same_for_all_units():
+        reason = form.reject_reason(data)
+        if reason is None or (isinstance(form, VelodyneFormat) and reason not in NOT_THE_MODEL):
+            return form.profile.model
+    return None
 
 
 @functools.cache

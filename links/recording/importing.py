@@ -21,6 +21,7 @@ from mcap.writer import MCAP0_MAGIC
 
 from flow.link import LinkError, Record
 from links.lidar import AnyFormat, packet_format, recognised_model, rig_unit
+from links.lidar.ouster import DATA_PORT as OUSTER_PORT
 from links.lidar.reject_reason import PacketRejectReason
 from links.lidar.velodyne import POSITION_BYTES, POSITION_PORT
 from links.recording.format import Progress
@@ -215,6 +216,8 @@ class _Capture(_ImportedFile):
         if self._other_ports:
             ((port, count),) = self._other_ports.most_common(1)
             return f"{text}; {count} on port {port}: try --port {port}"
+        if self._form is None and f"on UDP port {OUSTER_PORT}" in self._report.skipped:
+            text += f"; UDP port {OUSTER_PORT} is an Ouster's, which needs its metadata: --rig METADATA.json"
         seen = [f"{count} packets {reason}" for reason, count in self._report.skipped.most_common(3)]
         return "; ".join([text, *seen, *self._report.warnings])
 

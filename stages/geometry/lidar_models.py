@@ -77,6 +77,19 @@ _DELAYS_16 = tuple(2_304 * k for k in range(16))
 _UNIFORM_3_CM = 0.03 / math.sqrt(3)
 _VLP_FOOTPRINT_RAD = (3.0e-3, 1.5e-3)
 
+_VLP_32C_DEG = (
+    *(-25.0, -1.0, -1.667, -15.639, -11.31, 0.0, -0.667, -8.843),
+    *(-7.254, 0.333, -0.333, -6.148, -5.333, 1.333, 0.667, -4.0),
+    *(-4.667, 1.667, 1.0, -3.667, -3.333, 3.333, 2.333, -2.667),
+    *(-3.0, 7.0, 4.667, -2.333, -2.0, 15.0, 10.333, -1.333),
+)
+_HDL_32E_DEG = tuple(w for k in range(16) for w in (round(-92 / 3 + 4 * k / 3, 2), round(-28 / 3 + 4 * k / 3, 2)))
+
+
+def _from_focus(distance_mm: float, elevation_deg: tuple[float, ...]) -> tuple[float, ...]:
+    """Vertical offsets of beams that cross in one point at a distance from the spin axis."""
+    return tuple(-distance_mm * math.tan(math.radians(w)) for w in elevation_deg)
+
 
 def _ouster(model: str, lasers: int, half_fov_deg: float, origin_mm: float, min_range_m: float) -> LidarProfile:
     return LidarProfile(
@@ -142,16 +155,12 @@ _PROFILES: dict[str, LidarProfile] = {
         LidarProfile(
             model="VLP-32C",
             source="https://docslib.org/doc/7045953/vlp-32c-user-manual-63-9325-rev",  # tables 9-2 and 9-6
-            elevation_deg=(
-                *(-25.0, -1.0, -1.667, -15.639, -11.31, 0.0, -0.667, -8.843),
-                *(-7.254, 0.333, -0.333, -6.148, -5.333, 1.333, 0.667, -4.0),
-                *(-4.667, 1.667, 1.0, -3.667, -3.333, 3.333, 2.333, -2.667),
-                *(-3.0, 7.0, 4.667, -2.333, -2.0, 15.0, 10.333, -1.333),
-            ),
+            elevation_deg=_VLP_32C_DEG,
             azimuth_deg=(
                 *(1.4, -4.2, 1.4, -1.4, 1.4, -1.4, 4.2, -1.4, 1.4, -4.2, 1.4, -1.4, 4.2, -1.4, 4.2, -1.4),
                 *(1.4, -4.2, 1.4, -4.2, 4.2, -1.4, 1.4, -1.4, 1.4, -1.4, 1.4, -4.2, 4.2, -1.4, 1.4, -1.4),
             ),
+            vertical_offset_mm=_from_focus(42.4, _VLP_32C_DEG),  # envelope drawing 86-0130: distance of the focal point
             firing_ns=tuple(2_304 * (k // 2) for k in range(32)),  # lasers fire in pairs
             sequence_ns=55_296,
             range_unit_mm=4,
@@ -166,9 +175,8 @@ _PROFILES: dict[str, LidarProfile] = {
         LidarProfile(
             model="HDL-32E",
             source="https://manualsdump.com/amp/en/manuals/275446/20",  # appendices B and E
-            elevation_deg=tuple(
-                w for k in range(16) for w in (round(-92 / 3 + 4 * k / 3, 2), round(-28 / 3 + 4 * k / 3, 2))
-            ),
+            elevation_deg=_HDL_32E_DEG,
+            vertical_offset_mm=_from_focus(28.96, _HDL_32E_DEG),
             firing_ns=tuple(1_152 * k for k in range(32)),
             sequence_ns=46_080,
             range_unit_mm=2,

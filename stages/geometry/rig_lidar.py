@@ -32,7 +32,9 @@ class LidarBeams(BaseModel):
     spin_hz: Literal[10, 20] = 10  # Ouster
     columns_per_packet: Annotated[int, Field(ge=1, le=128)] = 16  # Ouster
     packets: OusterProfile = "LEGACY"  # Ouster: udp_profile_lidar
-    serial: Annotated[int | None, Field(exclude_if=_is_none)] = None  # packets of another unit are refused; None: not checked
+    serial: Annotated[int | None, Field(exclude_if=_is_none)] = (
+        None  # packets of another unit are refused; None: not checked
+    )
 
 
 class RigLidar(BaseModel):

@@ -56,7 +56,7 @@ TEXTS = {  # source file and its texts
     "links/lidar/udp.py": ["cannot listen on UDP", "is the network interface still up?", "no packet on UDP"],
     "links/lidar/lidar.py": [
         "consecutive packets are invalid",
-        "these packets come from a Velodyne",
+        "these packets come from a",
         "the sensor's clock is not locked to UTC",
         "the sensor's clock lost its lock to UTC",
         "no position packet arrives on UDP",

@@ -9,7 +9,7 @@ Source: Hesai PandarXT and PandarXT-16 user manuals, section 3.1 (packet) and ap
 
 from __future__ import annotations
 
-from links.lidar.packet_format import DUAL, MODES, PacketFormat, block_layout
+from links.lidar.packet_format import DUAL, MODE_NAMES, MODES, PacketFormat, block_layout
 from links.lidar.reject_reason import PacketRejectReason
 from stages.geometry.lidar_models import LidarProfile
 from stages.geometry.rig_lidar import LidarBeams
@@ -29,10 +29,10 @@ class HesaiFormat(PacketFormat):
     factory_port = DATA_PORT
 
     def __init__(self, profile: LidarProfile, beams: LidarBeams | None) -> None:
-        super().__init__(profile, beams, 1)
-        self.layout = block_layout(
+        layout = block_layout(
             BLOCKS, HEADER_BYTES, 0, ENTRY_BYTES, profile.lasers, profile.sequence_ns, profile.spin_hz[1]
         )
+        super().__init__(profile, beams, 1, layout)
         self._tail_at = HEADER_BYTES + BLOCKS * (2 + ENTRY_BYTES * profile.lasers)
         self.packet_bytes = self._tail_at + TAIL_BYTES + SEQUENCE_BYTES
 
@@ -72,7 +72,7 @@ class HesaiFormat(PacketFormat):
     def return_mode(self, data: bytes) -> str:
         """See PacketFormat."""
         mode = data[self._tail_at + RETURN_MODE_IN_TAIL] if len(data) > self._tail_at + RETURN_MODE_IN_TAIL else 0
-        return MODES.get(mode, f"0x{mode:02X}")
+        return MODE_NAMES[mode]
 
     def other_model(self, data: bytes) -> str | None:
         """See PacketFormat."""

@@ -54,7 +54,6 @@ class OusterFormat(PacketFormat):
     bit_ns = 1.0
 
     def __init__(self, profile: LidarProfile, beams: LidarBeams) -> None:
-        super().__init__(profile, beams, 1)
         self.beams = beams
         self.entries = entries = ENTRIES[beams.packets]
         self.column_ns = 1e9 / (beams.columns * beams.spin_hz)
@@ -79,7 +78,7 @@ class OusterFormat(PacketFormat):
         layout[columns.REFLECTIVITY_IN_ENTRY] = entries.reflectivity
         if entries.second is not None:
             layout[columns.SECOND_RANGE_IN_ENTRY], layout[columns.SECOND_REFLECTIVITY_IN_ENTRY] = entries.second
-        self.layout = layout
+        super().__init__(profile, beams, 1, layout)
         self.scales = np.array([1e-3 * entries.range_unit_mm, 1e-3 * beams.origin_mm, math.pi / 2])
         self.packet_bytes = 2 * entries.packet_head_bytes + beams.columns_per_packet * int(layout[columns.BLOCK_BYTES])
 

@@ -20,15 +20,17 @@ STRONGEST, LAST, DUAL = 0x37, 0x38, 0x39  # return mode byte: VLP-16 manual, tab
 
 
 class PacketFormat(ABC):
-    """Data packets of one model, and its beams. Rows of a packet: `max_rows` at most."""
+    """Data packets of one model, and its beams."""
 
     packet_bytes: int
     """Length of a data packet."""
     factory_port: int
     bit_ns: float = 10.0  # of the sensor's Ethernet
 
-    def __init__(self, profile: LidarProfile, beams: LidarBeams | None, sequences_per_block: int) -> None:
-        self.profile = profile
+    def __init__(
+        self, profile: LidarProfile, beams: LidarBeams | None, sequences_per_block: int, layout: NDArray[np.int64]
+    ) -> None:
+        self.profile, self.layout = profile, layout
         count = profile.lasers
         elevation = profile.elevation_deg if beams is None else beams.elevation_deg
         azimuth = (profile.azimuth_deg or (0.0,) * count) if beams is None else beams.azimuth_deg
@@ -47,18 +49,10 @@ class PacketFormat(ABC):
         if profile.turns_while_firing:
             self.pulses[:, columns.TURN_NS] = self.pulses[:, columns.DELAY_NS]
         self.pulses[:, columns.LASER] = laser
-        self.layout: NDArray[np.int64] = np.full(columns.LAYOUT, -1, dtype=np.int64)
         self.scales = np.array([1e-3 * profile.range_unit_mm, 0.0, 0.0])
-
-    @property
-    def max_rows(self) -> int:
+        second = layout[columns.SECOND_RANGE_IN_ENTRY] >= 0
+        self.max_rows = int(layout[columns.BLOCKS]) * len(self.pulses) * (2 if second else 1)
         """Most rows of a packet."""
-        return int(self.layout[columns.BLOCKS]) * len(self.pulses) * (2 if self.second_in_entry else 1)
-
-    @property
-    def second_in_entry(self) -> bool:
-        """Whether an entry holds two returns."""
-        return bool(self.layout[columns.SECOND_RANGE_IN_ENTRY] >= 0)
 
     def is_data(self, data: bytes) -> bool:
         """Whether a payload has the length of a data packet."""
@@ -97,6 +91,7 @@ class PacketFormat(ABC):
 
 
 MODES = {STRONGEST: "strongest", LAST: "last", DUAL: "dual"}
+MODE_NAMES = tuple(MODES.get(mode, f"0x{mode:02X}") for mode in range(256))
 
 
 def block_layout(

@@ -6,7 +6,7 @@ Source: VLP-16 User Manual 63-9243 Rev. E, chapter 9 (tables 9-1 to 9-4, figures
 
 from __future__ import annotations
 
-from links.lidar.packet_format import DUAL, LAST, MODES, STRONGEST, PacketFormat, block_layout
+from links.lidar.packet_format import DUAL, LAST, MODE_NAMES, STRONGEST, PacketFormat, block_layout
 from links.lidar.reject_reason import HOUR_US, PacketRejectReason
 from stages.geometry.lidar_models import LidarProfile
 
@@ -47,9 +47,9 @@ class VelodyneFormat(PacketFormat):
 
     def __init__(self, profile: LidarProfile) -> None:
         self.sequences_per_block = BLOCK_PULSES // profile.lasers
-        super().__init__(profile, None, self.sequences_per_block)
         block_ns = self.sequences_per_block * profile.sequence_ns
-        self.layout = block_layout(BLOCKS, 0, 2, CHANNEL_BYTES, BLOCK_PULSES, block_ns, profile.spin_hz[1])
+        layout = block_layout(BLOCKS, 0, 2, CHANNEL_BYTES, BLOCK_PULSES, block_ns, profile.spin_hz[1])
+        super().__init__(profile, None, self.sequences_per_block, layout)
         self._block_ns = block_ns
 
     def reject_reason(self, data: bytes) -> PacketRejectReason | None:
@@ -74,11 +74,11 @@ class VelodyneFormat(PacketFormat):
 
     def duration_ns(self, data: bytes) -> int:
         """See PacketFormat."""
-        return self.packet_ns(self.return_mode(data))
+        return self._block_ns * (BLOCKS // 2 if data[RETURN_MODE_AT] == DUAL else BLOCKS)
 
     def return_mode(self, data: bytes) -> str:
         """See PacketFormat."""
-        return MODES.get(data[RETURN_MODE_AT], f"0x{data[RETURN_MODE_AT]:02X}")
+        return MODE_NAMES[data[RETURN_MODE_AT]]
 
     def other_model(self, data: bytes) -> str | None:
         """See PacketFormat."""

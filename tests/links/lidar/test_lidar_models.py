@@ -23,7 +23,7 @@ from flow.link import LinkError, Record
 from links.lidar import Lidar, hesai_beams, ouster_beams, recognised_model
 from links.lidar.checks import LidarObservation, lidar_checks
 from links.lidar.reject_reason import PacketRejectReason
-from links.preflight.check_result import Status
+from links.preflight.check_result import Level
 from links.preflight.observations import ObservedSource
 from links.recording.pcap import PcapReport, read_datagrams
 from links.simulated.rig.scenario import RigLidar as ScenarioLidar
@@ -224,9 +224,9 @@ def test_preflight_expects_the_packet_rate_of_the_model(model):
     end_ns = records[-1].arrival_ns
     source = ObservedSource("lidar", lidar, observation, Counters.of(lidar.counters), None, end_ns, live=False)
     results = {result.name: result for result in lidar_checks(source)}
-    assert results["lidar rate"].status is Status.OK, results
-    assert results["lidar return mode"].text == "strongest"
-    assert results["lidar losses"].text == "0 of 300 packets lost"
+    assert results["lidar rate"].level is Level.OK, results
+    assert results["lidar return mode"].sentence == "strongest"
+    assert results["lidar losses"].sentence == "0 of 300 packets lost"
 
 
 @pytest.mark.parametrize("model", ["XT32", "OS1-128"])

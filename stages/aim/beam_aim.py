@@ -110,7 +110,7 @@ class BeamAim(Stage[BeamAimSettings]):
 
     def __init__(self, settings: BeamAimSettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
-        rotor = Rotor(self.settings.unit.azimuth_offset_rad)
+        rotor = Rotor(self.settings.unit.azimuth_offset_rad, self.settings.unit.azimuth_delay_ns)
         self._state = _State(SweepTrajectory(*self._travel_rad), GearPlay(self.settings.mount), rotor)
 
     @property

@@ -74,3 +74,9 @@ class RigLidar(BaseModel):
         profile = self.profile
         offsets_deg = self.beams.azimuth_deg if self.beams else profile.azimuth_deg or (0.0,) * profile.lasers
         return tuple(math.radians(offset) for offset in offsets_deg)
+
+    @property
+    def azimuth_delay_ns(self) -> tuple[int, ...]:
+        """Time from each laser's azimuth to its pulse."""
+        profile = self.profile
+        return (0,) * profile.lasers if profile.turns_while_firing else profile.firing_ns

@@ -183,7 +183,8 @@ class Scenario(_ScenarioSettings):
     def as_yaml(self) -> str:
         """The scenario as a file, with every setting (`OPTIONAL_KEYS` where used)."""
         unused = {name for name in OPTIONAL_KEYS if not getattr(self, name)}
-        settings = self.model_dump(mode="json", exclude_none=True, exclude=unused)
+        whole = self.model_copy(update={"lidar": self.lidar.of_model(self.rig.profile)})
+        settings = whole.model_dump(mode="json", exclude_none=True, exclude=unused)
         return yaml.safe_dump(settings, sort_keys=False, width=120)
 
     def rig_yaml(self) -> str:

@@ -22,6 +22,7 @@ from links.simulated.kernels.lidar import APERTURE_M, PULSE_LENGTH_M, echoes, se
 from links.simulated.kernels.ray_casting import Array32
 from links.simulated.world.weather import RainClutter, Weather
 from stages.geometry.frames import Array64
+from stages.geometry.lidar_models import LidarProfile
 from stages.kernels.lidar.packets import ORIGIN_M, RANGE_UNIT_M, Z_OFFSET_M
 
 VLP16 = packet_format("VLP-16")
@@ -81,6 +82,11 @@ class LidarSettings(BaseModel):
     min_range_m: float | None = None  # None: the model's
     max_range_m: float | None = None
 
+    def of_model(self, profile: LidarProfile) -> LidarSettings:
+        """The same with the model's limits where none are set."""
+        names = ("range_at_10_percent_m", "min_range_m", "max_range_m")
+        return self.model_copy(update={n: getattr(profile, n) for n in names if getattr(self, n) is None})
+
 
 class Environment(Protocol):
     """The environment of the LiDAR. Rays are grouped in pulses: (n, k, 3) with one time per pulse."""
@@ -119,9 +125,13 @@ class Lidar:
         self, settings: LidarSettings, start_ns: int, seed: int, weather: Weather | None = None, form: AnyFormat = VLP16
     ) -> None:
         weather = weather or Weather()
-        self.settings, self.form, profile = settings, form, form.profile
-        self.min_range_m = profile.min_range_m if settings.min_range_m is None else settings.min_range_m
-        self.max_range_m = profile.max_range_m if settings.max_range_m is None else settings.max_range_m
+        profile = form.profile
+        settings = settings.of_model(profile)
+        self.settings, self.form = settings, form
+        assert settings.min_range_m is not None
+        assert settings.max_range_m is not None
+        assert settings.range_at_10_percent_m is not None
+        self.min_range_m, self.max_range_m = settings.min_range_m, settings.max_range_m
         self._footprint_rad = profile.footprint_rad
         self._firing_ns = np.array(profile.firing_ns, dtype=np.int64)
         self._range_step_m = float(form.scales[RANGE_UNIT_M])
@@ -131,7 +141,7 @@ class Lidar:
         self._rotor_radps = settings.rotor_rpm / 60 * 2 * np.pi * (1 + fixed.normal(0, 3e-4))
         self._patterns = FOOTPRINTS[settings.footprint]
         self._bias_m = fixed.normal(0, settings.laser_bias_m, profile.lasers) + settings.range_offset_m
-        self._threshold = 0.10 / (settings.range_at_10_percent_m or profile.range_at_10_percent_m) ** 2
+        self._threshold = 0.10 / settings.range_at_10_percent_m**2
         self._extinction_per_m = weather.extinction_per_m()
         self._drops = None
         if weather.rain_mmph > 0:

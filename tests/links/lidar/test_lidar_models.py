@@ -19,6 +19,7 @@ from hand_built import captured, packet, record
 from scipy.spatial import cKDTree
 
 from flow.counters import Counters
+from flow.graph import load_graph
 from flow.link import LinkError, Record
 from links.lidar import Lidar, hesai_beams, ouster_beams, recognised_model
 from links.lidar.checks import LidarObservation, lidar_checks
@@ -28,11 +29,13 @@ from links.preflight.observations import ObservedSource
 from links.recording.pcap import PcapReport, read_datagrams
 from links.simulated.rig.scenario import RigLidar as ScenarioLidar
 from links.simulated.sensors.lidar_packets import PacketEncoder
+from stages.aim.beams import Rotor
 from stages.geometry.lidar_models import LIDAR_MODELS, lidar_profile
 from stages.geometry.rig_lidar import RigLidar
 from stages.messages import LidarFirings
 from tests.links.ports import free_port
 
+ROOT = Path(__file__).resolve().parents[3]
 OTHER = Path(__file__).resolve().parents[4] / "shared" / "data" / "lidar_other"
 OUSTER_SDK = environ.get("GRD_OUSTER_SDK_PYTHON")  # python of an environment with ouster-sdk, whose pins exclude ours
 START_NS = 1_748_773_230_000_000_000
@@ -241,6 +244,28 @@ def test_packets_of_the_model_arrive_live_over_udp(model):
     assert [each.data for each in received] == [each.data for each in sent]
     duration_ns = lidar.form.duration_ns(sent[0].data)
     assert all(duration_ns < each.arrival_ns - each.stamp_ns < duration_ns + 400_000 for each in received)
+
+
+@pytest.mark.parametrize("model", LIDAR_MODELS)
+def test_the_rotors_rate_is_right_although_lasers_point_aside(model):
+    unit = ScenarioLidar.model_validate({"model": model})
+    lidar, rotor = Lidar(unit=unit), Rotor(unit.azimuth_offset_rad, unit.azimuth_delay_ns)
+    for each in simulated_records(unit, 20):
+        firings = lidar.decode(each)
+        assert firings is not None
+        rotor.update(firings)
+    expected = math.tau / 1024 / (PacketEncoder(unit, "strongest").sequence_ns * 1e-9)
+    assert rotor.rate_radps == pytest.approx(expected, rel=0.03)  # a packet's azimuths are whole 0.01 deg
+
+
+@pytest.mark.parametrize("rig", sorted(path.name for path in (ROOT / "configs" / "rigs").glob("*.yaml")))
+def test_each_rig_file_fits_the_configuration_of_the_vehicle(rig, tmp_path):
+    config = tmp_path / "mine.yaml"
+    config.write_text(f"include: [{ROOT}/configs/field.yaml, {ROOT}/configs/rigs/{rig}]\n")
+    lidar = load_graph(config).nodes["lidar"].build()
+    assert isinstance(lidar, Lidar)
+    aim = load_graph(config).nodes["aim"].build()
+    assert aim.settings.unit == lidar.settings.unit
 
 
 # Angle correction file of the XT32 in the capture: elevations, azimuths.

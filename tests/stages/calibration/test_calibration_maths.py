@@ -14,7 +14,7 @@ from stages.calibration.patches import find_patches
 from stages.calibration.result import Travel, unseen
 from stages.calibration.scan_passes import Returns, ServoAt, ServoTrace, servo_at, smoothed
 from stages.calibration.servo_mount import harmonics, lidar_mount, servo_mount
-from stages.calibration.solve import NAMES, clustered, linearise, sandwich, surfaces, without_planes
+from stages.calibration.solve import NAMES, clustered, linearise, prior_information, sandwich, surfaces, without_planes
 from stages.geometry.frames import Harmonic, LidarMount, Pose
 from stages.kernels.calibration.scan_passes import play_sides
 from tests.stages.calibration.made_sweep import STEP_RAD, YARD, sweep, wrong_mount
@@ -228,5 +228,6 @@ def test_errors_common_to_a_surface_increase_the_sigmas():
     together = replace(system, residual=size * along * rng.choice([-1, 1], surface.max() + 1)[surface])
     separate = replace(system, residual=size * rng.choice([-1, 1], len(size)))
     moments = np.arange(len(size)) * 10**9  # no two returns at one moment
-    ratio = np.sqrt(np.diag(sandwich(together, moments))[0] / np.diag(sandwich(separate, moments))[0])
+    wide, narrow = (np.diag(sandwich(each, moments, prior_information(16)))[0] for each in (together, separate))
+    ratio = np.sqrt(wide / narrow)
     assert ratio > 5

@@ -10,7 +10,7 @@
         needs: $rig.cameras                # the stage is left out where the configuration has no such value
         low_priority: true                 # live: fewer images while other queues overflow: flow/live/backpressure.py
     links:
-      lidar: {use: links.velodyne.Lidar}   # sources and sinks: use, config, inputs, needs
+      lidar: {use: links.lidar.Lidar}   # sources and sinks: use, config, inputs, needs
 
 Source: ours.
 """

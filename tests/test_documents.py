@@ -42,6 +42,8 @@ def test_every_configuration_in_a_document_exists(file):
     made = {
         "configs/mine.yaml",
         "configs/rigs/mine.yaml",
+        "configs/rigs/os1_beams.yaml",
+        "configs/rigs/xt32_beams.yaml",
         "configs/rigs/vehicle_lens.yaml",
         "configs/rigs/drone_lens.yaml",
     }

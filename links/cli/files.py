@@ -6,7 +6,7 @@ Source: DESIGN, Command line.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 import yaml
@@ -18,19 +18,30 @@ from links.cli.console import EXIT_FAILED, err, out, progress_bar, report_errors
 from stages.geometry.frames import LidarMount
 
 MAX_RIG_BYTES = 100_000
+BEAM_FILES = (".json", ".csv")  # an Ouster's metadata, a Hesai XT's angle correction
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing output file.")]
 
 
 @report_errors
 def import_recording(
-    file: Annotated[Path, typer.Argument(help="A VLP-16 capture (.pcap) or a MAVLink log (.tlog).")],
+    file: Annotated[
+        Path,
+        typer.Argument(
+            help="A LiDAR's capture (.pcap), a MAVLink log (.tlog), or the beams of one LiDAR (.json, .csv)."
+        ),
+    ],
     out_file: Annotated[
         Path | None, typer.Option("--out", "-o", help="Recording to write [default: next to FILE].")
     ] = None,
     rig: Annotated[
-        Path | None, typer.Option("--rig", help="rig.yaml to attach [default for .pcap: bolted upright].")
+        Path | None,
+        typer.Option(
+            "--rig", help="rig.yaml to attach, or an Ouster's metadata .json [default for .pcap: bolted upright]."
+        ),
     ] = None,
-    port: Annotated[int, typer.Option("--port", help="UDP port of the LiDAR's data packets in the capture.")] = 2368,
+    port: Annotated[
+        int | None, typer.Option("--port", help="UDP port of the LiDAR's data packets [default: the model's].")
+    ] = None,
     sender: Annotated[
         str | None, typer.Option("--sender", help="IPv4 address of the LiDAR, if there are several.")
     ] = None,
@@ -38,11 +49,17 @@ def import_recording(
 ) -> None:
     """Convert a capture or a telemetry log to a recording.
 
+    An Ouster's metadata (.json) or the angle correction file of a Hesai XT (.csv) becomes a rig file with its model and
+    its beams, to be included after your rig.
+
     Example: grd import flight.pcap -o flight.mcap --rig configs/rigs/standard.yaml
     """
     from links.recording import import_file
 
-    rig_yaml = read_rig(rig) if rig is not None else None
+    if file.suffix in BEAM_FILES:
+        _import_beams(file, out_file, overwrite)
+        return
+    rig_yaml = None if rig is None else _upright_rig(rig) if rig.suffix in BEAM_FILES else read_rig(rig)
     with progress_bar(f"import {file.name}") as step:
         report = import_file(
             file, out_file, rig_yaml=rig_yaml, port=port, sender=sender, overwrite=overwrite, progress=step
@@ -53,6 +70,41 @@ def import_recording(
         warn(f"{count} skipped: {reason}")
     topics = ", ".join(f"{count} on {topic}" for topic, count in report.topics.items())
     out.print(f"{report.path}: {topics}", markup=False)
+
+
+def _import_beams(file: Path, out_file: Path | None, overwrite: bool) -> None:
+    """Write the model and the beams in a manufacturer's file as a rig file."""
+    lidar = _lidar_of(file)
+    target = out_file or file.with_suffix(".yaml")
+    if target.exists() and not overwrite:
+        raise LinkError(f"{target} exists already: give another name with -o, or --overwrite")
+    target.write_text(
+        yaml.safe_dump({"rig": {"lidar": lidar}}, sort_keys=False, default_flow_style=None, width=120), encoding="utf-8"
+    )
+    out.print(f"{target}: {lidar['model']}, {len(lidar['beams']['elevation_deg'])} beams", markup=False)
+
+
+def _upright_rig(file: Path) -> str:
+    """The rig of a capture without a known mount, with the beams in a manufacturer's file."""
+    from links.recording.importing import DEFAULT_RIG
+
+    lidar = _lidar_of(file)
+    rig = yaml.safe_load(DEFAULT_RIG.format(model=lidar["model"]))
+    rig["lidar"] |= lidar
+    return yaml.safe_dump(rig, sort_keys=False, default_flow_style=None, width=120)
+
+
+def _lidar_of(file: Path) -> dict[str, Any]:
+    """Model and beams in a manufacturer's file. LinkError if it is none."""
+    from links.lidar import hesai_beams, ouster_beams
+
+    text = file.read_text(encoding="utf-8", errors="replace")
+    if file.suffix == ".json":
+        model, beams = ouster_beams(text, str(file))
+    else:
+        beams = hesai_beams(text, str(file))
+        model = f"XT{len(beams.elevation_deg)}"
+    return {"model": model, "beams": beams.model_dump(mode="json")}
 
 
 def read_rig(file: Path) -> str:

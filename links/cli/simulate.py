@@ -14,6 +14,7 @@ from flow.link import LinkError
 from links.cli.console import EXIT_FAILED, EXIT_USAGE, err, out, progress_bar, report_errors, warn
 from links.cli.files import Overwrite
 from links.runs.shipped import shipped, shipped_option
+from stages.geometry.lidar_models import LIDAR_MODELS
 
 if TYPE_CHECKING:  # the simulator is an optional dependency
     from links.simulated.matrix.flights import Cell
@@ -108,6 +109,9 @@ def simulate_matrix(
     ] = False,
     odometry: Annotated[bool, typer.Option("--odometry", help="The vehicle sends odometry.")] = False,
     rain: Annotated[bool, typer.Option("--rain", help="Rain of 5 mm/h.")] = False,
+    lidar: Annotated[
+        str, typer.Option("--lidar", metavar="MODEL", help="LiDAR of the rig, as `rig.lidar.model`: XT32, OS1-64, ...")
+    ] = "VLP-16",
     autopilot: Annotated[
         bool, typer.Option("--autopilot", help="The drone sends telemetry over a radio, and obeys flight dynamics.")
     ] = False,
@@ -180,7 +184,11 @@ def simulate_matrix(
             out.print(cell.name, markup=False)
         return
     size_px = cameras_px or Conditions.cameras_px
-    conditions = Conditions(calibrated, odometry, rain, autopilot, cameras_hz, size_px, readout_ms or 0.0, perturbed)
+    if lidar not in LIDAR_MODELS:
+        raise LinkError(f"--lidar {lidar}: not one of {', '.join(LIDAR_MODELS)}")
+    conditions = Conditions(
+        calibrated, odometry, rain, autopilot, cameras_hz, size_px, readout_ms or 0.0, lidar, perturbed
+    )
     several = range(first_seed, first_seed + seeds)
     with progress_bar(f"{len(selected) * seeds} recordings") as step:
         report = make_matrix(folder, selected, several, closed_loop, step, conditions, results, jobs, images)

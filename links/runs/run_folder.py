@@ -22,6 +22,7 @@ from flow.replay import RunReport, replay
 from flow.stage import Stage
 from flow.subprocess_replay import can_use_subprocesses, replay_in_subprocesses
 from flow.taps import Digest
+from links.lidar import Lidar, recorded_lidars
 from links.mavlink.autopilot import Autopilot
 from links.recording import Progress, Session
 from links.runs.request import RunRequest, RunResult
@@ -30,7 +31,6 @@ from links.runs.results import SUMMARY_FILE, Results
 from links.runs.summary import summary
 from links.runs.truth import TruthLog, read_truth_file
 from links.runs.usage import Usage
-from links.velodyne import Lidar, recorded_lidars
 from links.viewer import Viewer
 from links.viewer.scene import Gate
 from stages.messages import Detections, DroneFix, RelativePose

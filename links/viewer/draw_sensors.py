@@ -35,15 +35,11 @@ GOAL_COLOUR = np.array([colours.DRONE], dtype=np.uint32)
 STEP_M = 0.002  # one count of the u16 images, the VLP-16's own resolution
 COLUMNS = 900  # of the range image: 0.4 deg, the spacing of firings at 20 turns a second
 
-# VLP-16 user manual 63-9243, table 9-1: elevation of the 16 lasers in the packet's order.
-ELEVATION_DEG = np.array([-15, 1, -13, 3, -11, 5, -9, 7, -7, 9, -5, 11, -3, 13, -1, 15])
-ROW_OF_LASER = (15 - ELEVATION_DEG) // 2  # top row: the highest beam
-
 
 def lidar_firings(message: LidarFirings, name: str, scene: ViewerScene) -> Entities:
     """The range image and the number of lost packets.
 
-    The image is a tensor, because a tensor view stretches 16 rows to a readable height.
+    The image is a tensor, because a tensor view stretches few rows to a readable height.
     """
     counts = range_counts(message)
     yield Entity(f"range/{name}", rr.Tensor(counts, dim_names=("laser", "azimuth"), value_range=(0.0, 60.0 / STEP_M)))
@@ -133,10 +129,11 @@ def score_image(message: ScoreImage, name: str, scene: ViewerScene) -> Entities:
 
 def range_counts(firings: LidarFirings) -> NDArray[np.uint16]:
     """Range by laser (rows, highest beam on top) and azimuth (columns, 0 along +y_lidar); the newest return wins."""
-    image = np.zeros((16, COLUMNS), dtype=np.uint16)
+    row_of_laser = np.argsort(np.argsort(-firings.laser_elevation_rad))
+    image = np.zeros((len(row_of_laser), COLUMNS), dtype=np.uint16)
     hit = (firings.range_m > 0) & (firings.return_kind == 0)
     column = (firings.azimuth_rad[hit] / (2 * np.pi) * COLUMNS).astype(np.int64) % COLUMNS
-    image[ROW_OF_LASER[firings.laser[hit] % 16], column] = _counts(firings.range_m[hit])
+    image[row_of_laser[firings.laser[hit]], column] = _counts(firings.range_m[hit])
     return image
 
 

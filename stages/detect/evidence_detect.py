@@ -34,6 +34,7 @@ from stages.detect.observations import ObservationFinder, ObservationLimits, Sli
 from stages.detect.reacquire import reacquired_candidate, without_duplicates
 from stages.detect.telemetry import DetectorTelemetry
 from stages.geometry.frames import Array64
+from stages.geometry.rig_lidar import RigLidar
 from stages.geometry.trajectory import VehicleTrajectory
 from stages.kernels.detect.candidate import SIGMA_M
 from stages.kernels.detect.candidate_table import first_within
@@ -93,6 +94,7 @@ class EvidenceDetectSettings(Settings):
     """Settings of `EvidenceDetect`."""
 
     span_m: float = Field(0.5, gt=0, le=10)  # largest dimension of the drone
+    unit: RigLidar = RigLidar()  # model of the LiDAR
     lowest_deg: float = Field(4.0, ge=-30, le=80)  # least elevation of candidates above the LiDAR's horizon
     nearest_m: float = Field(1.5, ge=0.3)  # least range of candidates
     furthest_m: float = Field(65.0, gt=1)  # greatest range of candidates
@@ -130,7 +132,8 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
             settings.furthest_m,
             settings.clear_m,
         )
-        self._now = _State(ObservationFinder(limits), Travel(math.radians(settings.sweep_deg - 3.0), math.radians(0.5)))
+        finder = ObservationFinder(limits, settings.unit.profile)
+        self._now = _State(finder, Travel(math.radians(settings.sweep_deg - 3.0), math.radians(0.5)))
 
     def on_motion(self, motion: VehicleMotion) -> None:
         """Update the vehicle's trajectory. Without it only vertical motion counts, unless `parked` is set."""

@@ -37,13 +37,13 @@ from flow.remote.codec import MAX_BYTES, CodecError, decode, encode
 from links.camera import Camera
 from links.dynamixel.bus import BlockingPort, Bus, BusError
 from links.dynamixel.servo import Servo
+from links.lidar import Lidar
+from links.lidar.position import PpsMonitor
 from links.mavlink import Autopilot
 from links.mavlink.transport.framing import FrameSplitter, dialect, frame_bytes
 from links.recording import CompressedImage, RecordingReader, RecordingWriter, encode_compressed_image
 from links.simulated.sensors.protocol2 import status
 from links.vehicle_odometry import VehicleOdometry
-from links.velodyne import Lidar
-from links.velodyne.position import PpsMonitor
 from links.zenoh.envelope import read_envelope
 from stages import messages
 from tests.links.fuzz_files import files

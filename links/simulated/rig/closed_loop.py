@@ -28,10 +28,10 @@ from flow.replay import Replay, RunReport
 from flow.taps import Digest
 from links.dynamixel import Servo
 from links.dynamixel.servo import NOT_LIVE, GoalCommand
+from links.lidar import Lidar
 from links.runs.request import RunRequest
 from links.simulated.rig.pose_loop import PoseLoop, PoseTap, has_autopilot
 from links.simulated.sensors.servo import STEP_NS
-from links.velodyne import Lidar
 from stages.messages import ServoGoal
 
 LONGEST_BATCH_NS = 40_000_000  # longer batches are not faster

@@ -31,11 +31,14 @@ from links.simulated.world.procedural import SceneSettings
 from links.simulated.world.suspension import SuspensionSettings
 from links.simulated.world.vehicle import vehicle_mesh_from_camera
 from links.simulated.world.weather import Weather
+from stages.geometry import rig_lidar
 from stages.geometry.frames import Array64, LidarMount, Pose
+from stages.geometry.lidar_models import LIDAR_MODELS, lidar_profile
 
 CLEARANCE_M = 0.3  # minimum height of a drone above the road
 WHEELS_M = 0.15  # maximum height of the vehicle's motion above or below the road
 BLADE_STEPS = 4  # blade angles within half a turn, for the camera mask
+OUSTER_STAGGER_DEG = 4.2, 1.4, -1.4, -4.2  # azimuth offsets of an OS1's lasers: firmware manual, beam angles
 OPTIONAL_KEYS = ("other_drones", "truth_visible", "lidar_gaps_s")  # written to a scenario file only where used
 
 
@@ -59,14 +62,28 @@ class DroneSettings(_ScenarioSettings):
     path: Path
 
 
-class RigLidar(_ScenarioSettings):
-    """The LiDAR on its turntable, as in the rig file."""
+class RigLidar(rig_lidar.RigLidar):
+    """The LiDAR on its turntable, as in the rig file. An Ouster without beams gets evenly spaced ones."""
 
-    model: Literal["VLP-16"] = "VLP-16"
     mount: LidarMount = LidarMount(
         T_vehicle_turntable=Pose(xyz_m=(0.0, 0.0, 0.25)),
         T_turntable_lidar=Pose(xyz_m=(0.0, 0.0, 0.10), rpy_deg=(90.0, 0.0, 0.0)),
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_beams(cls, values: Any) -> Any:
+        model = values.get("model") if isinstance(values, dict) else None
+        if not isinstance(model, str) or model not in LIDAR_MODELS or not model.startswith("OS") or "beams" in values:
+            return values
+        profile = lidar_profile(model)
+        beams = rig_lidar.LidarBeams(
+            elevation_deg=profile.elevation_deg,
+            azimuth_deg=tuple(OUSTER_STAGGER_DEG[k % 4] for k in range(profile.lasers)),
+            origin_mm=profile.origin_mm,
+            packets="RNG19_RFL8_SIG16_NIR16",
+        )
+        return {**values, "beams": beams}
 
 
 class Scenario(_ScenarioSettings):
@@ -169,7 +186,8 @@ class Scenario(_ScenarioSettings):
     def as_yaml(self) -> str:
         """The scenario as a file, with every setting (`OPTIONAL_KEYS` where used)."""
         unused = {name for name in OPTIONAL_KEYS if not getattr(self, name)}
-        settings = self.model_dump(mode="json", exclude_none=True, exclude=unused)
+        whole = self.model_copy(update={"lidar": self.lidar.of_model(self.rig.profile)})
+        settings = whole.model_dump(mode="json", exclude_none=True, exclude=unused)
         return yaml.safe_dump(settings, sort_keys=False, width=120)
 
     def rig_yaml(self) -> str:

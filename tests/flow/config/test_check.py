@@ -255,7 +255,7 @@ def test_only_a_driver_that_cannot_be_imported_is_not_suggested(monkeypatch):
 
 def test_a_class_that_only_the_engine_makes_is_not_suggested():
     classes = known_classes("links")
-    assert classes["links.velodyne.Lidar"].__name__ == "Lidar"
+    assert classes["links.lidar.Lidar"].__name__ == "Lidar"
     assert not [path for path in classes if path.startswith("links.zenoh.")]  # a hosts file makes these
 
 

@@ -90,7 +90,7 @@ def test_a_run_in_several_parts_is_repeated_and_replayed_as_a_whole(grd, tmp_pat
 
 
 def test_a_live_recording_has_the_sender_with_the_channel(tmp_path):
-    lidar = "  lidar: {use: links.velodyne.Lidar, config: {port: 42368, sender: 127.0.0.9}}\n"
+    lidar = "  lidar: {use: links.lidar.Lidar, config: {port: 42368, sender: 127.0.0.9}}\n"
     (tmp_path / "lidar.yaml").write_text(CONFIG.replace("  recorder: {use: links.recording.Recorder}\n", lidar))
     asked = RunRequest(tmp_path / "lidar.yaml")
     run_folder = RunFolder(tmp_path / "run", tmp_path / "flight.mcap", asked, live_graph(asked), live=True)

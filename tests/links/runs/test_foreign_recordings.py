@@ -24,7 +24,7 @@ SWEEP = {
     "config": {"mount": "$rig.lidar.mount"},
     "inputs": {"firings": "lidar.lidar_firings"},
 }
-LIDAR = {"use": "links.velodyne.Lidar"}
+LIDAR = {"use": "links.lidar.Lidar"}
 MAX_S = 20.0  # of processor time, for one attack
 
 

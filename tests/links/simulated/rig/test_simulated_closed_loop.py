@@ -171,7 +171,7 @@ def test_sim_yaml_closes_the_loop_and_a_graph_without_servo_commands_is_rejected
 
 
 @pytest.mark.parametrize("topic", ["/truth/drone", "/truth/vehicle", "/truth"])
-@pytest.mark.parametrize("link", ["links.velodyne.Lidar", "links.dynamixel.Servo"])
+@pytest.mark.parametrize("link", ["links.lidar.Lidar", "links.dynamixel.Servo"])
 def test_no_stage_can_be_wired_to_truth(tmp_path: FilePath, topic: str, link: str) -> None:
     """Every path from a record to a stage starts at a source, and no source may have such a topic."""
     text = GRAPH.replace("links:\n", f"links:\n  spy: {{use: {link}, config: {{topic: {topic}}}}}\n")

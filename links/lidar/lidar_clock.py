@@ -1,4 +1,4 @@
-"""Host time of VLP-16 packets from the sensor's microseconds of the hour.
+"""Host time of LiDAR packets from the sensor's microseconds of the hour.
 
 `free`: the phase of the sensor's clock is unknown. Host time is device time + offset. A packet can arrive late but not
 early, so
@@ -20,8 +20,7 @@ from __future__ import annotations
 
 from typing import Literal, NamedTuple
 
-from links.velodyne import vlp16
-from links.velodyne.reject_reason import PacketRejectReason
+from links.lidar.reject_reason import HOUR_US, PacketRejectReason
 
 ClockMode = Literal["free", "utc"]
 
@@ -59,7 +58,7 @@ class LidarClock:
     def _read_free(self, device_us: int, host_ns: int) -> PacketTime | PacketRejectReason:
         if self._last_us is None:
             return self._anchor(device_us, host_ns)
-        step_us = _wrap(device_us - self._last_us, vlp16.HOUR_US)
+        step_us = _wrap(device_us - self._last_us, HOUR_US)
         device_ns = self._device_ns + 1_000 * step_us
         offset_ns = host_ns - device_ns
         if abs(offset_ns - self._min_ns) > self._limit_ns or step_us < -REORDER_US:
@@ -86,11 +85,11 @@ class LidarClock:
         return PacketTime(host_ns, 0)
 
     def _read_utc(self, device_us: int, host_ns: int) -> PacketTime | PacketRejectReason:
-        early_ns = _wrap(1_000 * device_us - host_ns, 1_000 * vlp16.HOUR_US)
+        early_ns = _wrap(1_000 * device_us - host_ns, 1_000 * HOUR_US)
         if abs(early_ns) > self._limit_ns:
             self.disagreements += 1
             return PacketRejectReason.CLOCK
-        step_us = 0 if self._last_us is None else _wrap(device_us - self._last_us, vlp16.HOUR_US)
+        step_us = 0 if self._last_us is None else _wrap(device_us - self._last_us, HOUR_US)
         if self._last_us is not None and -REORDER_US <= step_us <= 0:
             return PacketRejectReason.ORDER
         self._last_us = device_us

@@ -24,14 +24,14 @@ from flow.graph import load_graph
 from flow.link import LinkError
 from flow.message import array_fields, check_arrays
 from flow.replay import replay
-from links.velodyne import Lidar
-from links.velodyne.reject_reason import PacketRejectReason
+from links.lidar import Lidar
+from links.lidar.reject_reason import PacketRejectReason
 
 SWEEP = """\
 stages:
   sweep: {use: stages.sweep.Sweep, config: {mount: {turns: false}}, inputs: {firings: lidar.lidar_firings}}
 links:
-  lidar: {use: links.velodyne.Lidar}
+  lidar: {use: links.lidar.Lidar}
 """
 
 
@@ -169,7 +169,7 @@ def test_dual_return_blocks_of_one_pulse_share_their_azimuth():
     ("product", "name"), [(HDL32E, "HDL-32E"), (PUCK_HI_RES, "Puck Hi-Res"), (0x28, "VLP-32C"), (0xA1, "VLS-128")]
 )
 def test_another_model_is_rejected_by_name_at_its_first_packet(product, name):
-    with pytest.raises(LinkError, match=rf"Velodyne {name}.*grd supports the VLP-16"):
+    with pytest.raises(LinkError, match=rf"Velodyne {name}.*the rig's LiDAR is a VLP-16"):
         Lidar().decode(record(packet(product=product)))
 
 
@@ -193,7 +193,9 @@ def test_a_hundred_consecutive_bad_packets_are_an_error_with_the_reasons():
         assert lidar.decode(record(bytes(1206))) is None
     for _ in range(39):
         assert lidar.decode(record(bytes(100))) is None
-    with pytest.raises(LinkError, match=r"100 consecutive packets.*60 not the VLP-16's product id, 40 not 1206 bytes"):
+    with pytest.raises(
+        LinkError, match=r"100 consecutive packets.*60 not the model's product id, 40 of another length"
+    ):
         lidar.decode(record(bytes(100)))
 
 

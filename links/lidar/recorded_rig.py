@@ -9,7 +9,7 @@ from typing import Any, cast
 
 from flow.config.yaml_text import YamlTextError, yaml_values
 
-USE = "links.velodyne.Lidar"
+USE = "links.lidar.Lidar"
 
 
 def recorded_lidars(config_yaml: str | None) -> list[dict[str, Any]]:

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from hand_built import HOUR_NS, SINGLE_PACKET_NS, captured_records
 
-from links.velodyne import Lidar
-from links.velodyne.lidar_clock import LidarClock, PacketTime
-from links.velodyne.reject_reason import PacketRejectReason
+from links.lidar import Lidar
+from links.lidar.lidar_clock import LidarClock, PacketTime
+from links.lidar.reject_reason import PacketRejectReason
 
 START_NS = 1_700_000_000_000_000_123
 

@@ -11,14 +11,14 @@ from collections.abc import Iterator
 
 from flow.graph import Graph
 from flow.link import Record, Source
+from links.lidar.formats import AnyFormat
+from links.lidar.lidar import POSITION_TOPIC, Lidar
+from links.lidar.position import PpsMonitor
+from links.lidar.reject_reason import HOUR_US
 from links.preflight.check_result import CheckResult, fail, ok, warning
 from links.preflight.link_checks import LinkChecks, declares
 from links.preflight.observations import Observation, Observations, ObservedSource
-from links.velodyne import vlp16
-from links.velodyne.lidar import POSITION_TOPIC, Lidar
-from links.velodyne.position import PpsMonitor
 
-MODES = {vlp16.STRONGEST: "strongest", vlp16.LAST: "last", vlp16.DUAL: "dual"}
 FAIL_LOSS, WARN_LOSS = 0.02, 0.001  # share of packets
 RATE_TOLERANCE = 0.2  # losses are checked separately; this finds a second LiDAR, or a host that stalls
 MAX_DRIFT_PPM = 500.0
@@ -32,9 +32,10 @@ MAX_DEVICE_TIMES = 100_000
 class LidarObservation(Observation):
     """Return modes, GPS/PPS status, and the sensor's clock against the host's."""
 
-    def __init__(self, topic: str) -> None:
+    def __init__(self, topic: str, form: AnyFormat) -> None:
         super().__init__(topic)
-        self.return_modes: Counter[int] = Counter()
+        self._form = form
+        self.return_modes: Counter[str] = Counter()
         self.pps = PpsMonitor()
         self.device_ns: list[tuple[int, int]] = []
         """(host stamp, sensor's time of the hour), both in ns, of each packet of the first minute."""
@@ -50,26 +51,26 @@ class LidarObservation(Observation):
         super().add(record)
         if record.topic == POSITION_TOPIC:
             self.pps.add(record.data)
-        elif record.topic == self.topic and len(record.data) == vlp16.PACKET_BYTES:
-            self.return_modes[record.data[vlp16.RETURN_MODE_AT]] += 1
-            if len(self.device_ns) < MAX_DEVICE_TIMES:
-                at = vlp16.TIMESTAMP_AT
-                self.device_ns.append((record.stamp_ns, 1_000 * int.from_bytes(record.data[at : at + 4], "little")))
+        elif record.topic == self.topic and self._form.is_data(record.data):
+            self.return_modes[self._form.return_mode(record.data)] += 1
+            if len(self.device_ns) < MAX_DEVICE_TIMES and self._form.reject_reason(record.data) is None:
+                self.device_ns.append((record.stamp_ns, 1_000 * self._form.timestamp_us(record.data)))
 
 
 class LidarChecks(LinkChecks):
-    """Checks of a VLP-16."""
+    """Checks of a LiDAR."""
 
     link_class = Lidar
 
     def observation(self, source: Source) -> LidarObservation:
         """See LinkChecks."""
-        return LidarObservation(source.topic)
+        assert isinstance(source, Lidar)
+        return LidarObservation(source.topic, source.form)
 
     def check_configuration(self, graph: Graph) -> Iterator[CheckResult]:
         """A LiDAR is required."""
         if not declares(graph, Lidar):
-            yield fail("lidar", "not in this configuration: nothing sees the drone; add links.velodyne.Lidar")
+            yield fail("lidar", "not in this configuration: nothing sees the drone; add links.lidar.Lidar")
 
     def check_source(self, source: ObservedSource, observations: Observations) -> Iterator[CheckResult]:
         """See LinkChecks."""
@@ -89,14 +90,14 @@ def lidar_checks(source: ObservedSource) -> Iterator[CheckResult]:
         why = source.status or _rejected(source) or "none was valid"
         yield fail(f"{name} packets", f"{observation.records.count} packets arrived, and {_sentence(why)}")
         return
-    yield _rate(source, observation, link.settings.timeout_s)
+    yield _rate(source, link, observation)
     yield _losses(source, decoded)
     foreign = source.counters.get("from other senders", 0)
     if foreign:
         yield warning(
             f"{name} sender", f"{foreign} packets from other senders were ignored: is a second LiDAR on this network?"
         )
-    yield _mode(name, observation)
+    yield _mode(name, link, observation)
     yield _clock(name, link, source, observation)
     if link.settings.position_port is not None or observation.topics[POSITION_TOPIC].count:
         yield _position(link, name, observation)
@@ -110,14 +111,14 @@ def _rejected(source: ObservedSource) -> str:
     return ", ".join(f"{count} {reason}" for reason, count in source.counters.rejected.items() if count)
 
 
-def _rate(source: ObservedSource, observation: LidarObservation, timeout_s: float) -> CheckResult:
-    """Packet rate: one per 1.327 ms, or 0.664 ms with dual return."""
+def _rate(source: ObservedSource, link: Lidar, observation: LidarObservation) -> CheckResult:
+    """Packet rate: one per duration of a packet's pulses."""
     name = f"{source.name} rate"
-    mode = observation.return_modes.most_common(1)[0][0] if observation.return_modes else vlp16.STRONGEST
-    expected_hz, rate_hz = 1e9 / vlp16.packet_ns(mode), observation.records.rate_hz
+    mode = observation.return_modes.most_common(1)[0][0] if observation.return_modes else "strongest"
+    expected_hz, rate_hz = 1e9 / link.form.packet_ns(mode), observation.records.rate_hz
     silent_s = observation.records.longest_silence_s(source.end_ns)
     text = f"{rate_hz:.0f} packets/s, expected {expected_hz:.0f}"
-    if source.live and silent_s > timeout_s:
+    if source.live and silent_s > link.settings.timeout_s:
         return fail(name, f"{text}; then none for {silent_s:.1f} s: check its cable and power")
     if not rate_hz >= (1 - RATE_TOLERANCE) * expected_hz:
         return fail(name, f"{text}: is the network too slow, or this host too busy?")
@@ -136,13 +137,13 @@ def _losses(source: ObservedSource, decoded: int) -> CheckResult:
     return warning(name, text) if share > WARN_LOSS or rejected else ok(name, text)
 
 
-def _mode(name: str, observation: LidarObservation) -> CheckResult:
+def _mode(name: str, link: Lidar, observation: LidarObservation) -> CheckResult:
     name = f"{name} return mode"
-    modes = [MODES.get(mode, f"0x{mode:02X}") for mode in observation.return_modes]
+    modes, profile = list(observation.return_modes), link.form.profile
     if len(modes) != 1:
         return fail(name, f"it changes ({', '.join(modes)}): does another program set it, or do two LiDARs send?")
-    if modes[0] not in MODES.values():
-        return fail(name, f"{modes[0]} is not a known mode: is this a VLP-16?")
+    if modes[0] not in (*profile.return_modes, "dual"):
+        return fail(name, f"{modes[0]} is not a known mode: is this a {profile.model}?")
     if modes[0] == "last":
         return warning(
             name, "last return: of a drone in front of a wall only the edges are measured; set strongest or dual"
@@ -173,7 +174,7 @@ def clock_drift_ppm(pairs: list[tuple[int, int]]) -> float:
     """Rate of host - device [ppm], by the fastest packet of the first third and of the last third; NaN: too short."""
     if len(pairs) < 3 or pairs[-1][0] - pairs[0][0] < 1e9 * MIN_DRIFT_TIME_S:
         return math.nan
-    hour_ns = 1_000 * vlp16.HOUR_US
+    hour_ns = 1_000 * HOUR_US
     first_offset = pairs[0][0] - pairs[0][1]
     third_ns = (pairs[-1][0] - pairs[0][0]) / 3
     offsets = [(host, (host - device - first_offset + hour_ns // 2) % hour_ns - hour_ns // 2) for host, device in pairs]

@@ -1,6 +1,6 @@
 """grd's VLP-16 decoder compared with velodyne-decoder, on the same 1000 real packets in one run. One round decodes them all.
 
-    python -m pytest tests/benchmarks/bench_velodyne.py --benchmark-columns=min,median,iqr,rounds
+    python -m pytest tests/benchmarks/bench_lidar.py --benchmark-columns=min,median,iqr,rounds
 
 Times are per 1000 packets: 1 ms is 1 us per packet. What each row does:
 - ours, whole decode: bytes to `LidarFirings` (fresh arrays, int64 times, every pulse), checks, clock, counters.
@@ -19,8 +19,9 @@ import pytest
 import velodyne_decoder
 
 from flow.link import Record
-from links.velodyne import Lidar, decode
-from links.velodyne.decode import compile_kernels
+from links.lidar import Lidar, packet_format
+from links.lidar.decode import compile_kernels
+from stages.kernels.lidar.packets import decode
 
 CAPTURE = Path(__file__).resolve().parents[3] / "shared" / "data" / "lidar" / "vlp16_strongest_einride.pcap"
 CONFIG = velodyne_decoder.Config(min_range=0.0, max_range=200.0)
@@ -74,11 +75,12 @@ def test_ours_whole_decode_dual(benchmark, records):
 
 def test_ours_kernel(benchmark, records):
     sizes = (np.int64, np.uint8, np.float32, np.float32, np.uint8, np.uint8)
-    arrays = [np.empty(decode.PULSES, dtype) for dtype in sizes] + [np.empty((decode.PULSES, 3), np.float32)]
+    form = packet_format("VLP-16")
+    arrays = [np.empty(form.max_rows, dtype) for dtype in sizes] + [np.empty((form.max_rows, 3), np.float32)]
 
     def run():
         for record in records:
-            decode._decode(record.data, record.stamp_ns, *arrays)
+            decode(record.data, record.stamp_ns, form.layout, form.scales, form.pulses, *arrays)
 
     benchmark(run)
 

@@ -8,8 +8,8 @@ import velodyne_decoder
 from hand_built import DUAL, LAST, PACKET, STRONGEST, captured_records, packet, record
 
 from flow.message import check_arrays
-from links.velodyne import Lidar
-from links.velodyne.vlp16 import ELEVATION_DEG
+from links.lidar import Lidar
+from stages.geometry.lidar_models import lidar_profile
 
 REAL = ["vlp16_strongest_einride", "vlp16_strongest_gps_mrpt"]
 
@@ -156,7 +156,7 @@ def difference_to_oracle(data):
     x, y, z, reflectivity, time_s, _, ring, kind = theirs.T
 
     laser = ours.laser[mine]
-    assert (np.argsort(np.argsort(ELEVATION_DEG))[laser] == ring).all()
+    assert (np.argsort(np.argsort(lidar_profile("VLP-16").elevation_deg))[laser] == ring).all()
     assert (ours.reflectivity[mine] == reflectivity).all()
     if data[1204] == DUAL:
         assert ((ours.return_kind[mine] == 1) == (kind == 2)).all()

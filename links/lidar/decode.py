@@ -1,12 +1,13 @@
-"""Decoder of VLP-16 data packets: every laser pulse with its time, azimuth, range and xyz in the lidar frame.
+"""Decoder of data packets: every laser pulse with its time, azimuth, range and xyz in the lidar frame.
 
-    azimuth = azimuth_block + rate * (time since the block's first pulse)
+    azimuth = azimuth_block + rate * (time since the block's first pulse) + azimuth offset of the laser
     x = r cos(el) sin(az)    y = r cos(el) cos(az)    z = r sin(el) + vertical offset of the laser
 
 `rate` is the packet's mean rate, (azimuth of the last block - azimuth of the first) / (time between them). A block's
 azimuth jitters by 0.01 to 0.02 deg: a rate from two neighbouring blocks gives an error of 0.4 mrad at the block's last
-pulses, the mean rate 0.1 mrad. sin and cos are computed only for the 12 blocks and the 32 pulse delays, and combined by
-the addition theorems. The compiled functions are in `stages/kernels/velodyne.py`.
+pulses, the mean rate 0.1 mrad. sin and cos are computed only for the blocks and the pulse delays, and combined by the
+addition theorems. Beams that start at a distance n from the axis have r - n instead of r, from n (sin(azimuth_block),
+cos(azimuth_block), 0). The compiled functions are in `stages/kernels/lidar/packets.py`.
 
 Source: VLP-16 User Manual 63-9243 Rev. E, sections 9.3 to 9.5; the mean rate is ours.
 """
@@ -15,21 +16,24 @@ from __future__ import annotations
 
 import numpy as np
 
-from links.velodyne import vlp16
-from stages.kernels.velodyne import LASER_ELEVATION_RAD, PULSES, decode, decode_dual
+from links.lidar.formats import AnyFormat, packet_format
+from links.lidar.packet_format import DUAL, STRONGEST
+from links.lidar.velodyne import RETURN_MODE_AT
+from stages.kernels.lidar.packets import decode, decode_dual
 from stages.messages import LidarFirings
 
 
 class FiringRows:
     """Collects the pulses of consecutive data packets into one LidarFirings message."""
 
-    def __init__(self, max_packets: int) -> None:
+    def __init__(self, form: AnyFormat, max_packets: int) -> None:
         """`max_packets`: packets in a message."""
+        self._form = form
         self._max_packets = max_packets
         self._start()
 
     def _start(self) -> None:
-        rows = self._max_packets * PULSES
+        rows = self._max_packets * self._form.max_rows
         self.packets = self._rows = self._stamp_ns = self._lost_packets = 0
         self._pulse_stamp_ns = np.empty(rows, np.int64)
         self._laser = np.empty(rows, np.uint8)
@@ -47,16 +51,20 @@ class FiringRows:
     def add(self, data: bytes, stamp_ns: int, lost_packets: int) -> bool:
         """Add every pulse of a packet that `reject_reason` accepts and whose first laser fired at stamp_ns.
 
-        Single return gives 384 rows, dual return 192 to 384, in firing order: one row of kind 0 per pulse, with range 0
-        and xyz (0, 0, 0) where nothing returned. In dual return mode a row of kind 1 with the same time follows where
-        the last return differs from the strongest (or from the second strongest, which the sensor sends when the last
-        return is the strongest). Returns False and adds nothing when the azimuths are invalid.
+        Rows are in firing order (a VLP-16: 384 in single return, 192 to 384 in dual return): one row of kind 0 per
+        pulse, with range 0 and xyz (0, 0, 0) where nothing returned. In dual return mode a row of kind 1 with the same
+        time follows where the last return differs from the strongest (or from the second strongest, which the sensor
+        sends when the last return is the strongest). Returns False and adds nothing when the azimuths are invalid.
         """
-        free = slice(self._rows, self._rows + PULSES)
-        kernel = decode_dual if data[vlp16.RETURN_MODE_AT] == vlp16.DUAL else decode
+        form = self._form
+        free = slice(self._rows, self._rows + form.max_rows)
+        kernel = decode_dual if form.return_mode(data) == "dual" else decode
         rows = kernel(
             data,
             stamp_ns,
+            form.layout,
+            form.scales,
+            form.pulses,
             self._pulse_stamp_ns[free],
             self._laser[free],
             self._azimuth_rad[free],
@@ -86,7 +94,7 @@ class FiringRows:
             return_kind=self._return_kind[filled],
             xyz_lidar_m=self._xyz_lidar_m[filled],
             lost_packets=self._lost_packets,
-            laser_elevation_rad=LASER_ELEVATION_RAD,
+            laser_elevation_rad=self._form.elevation_rad,
         )
         self._start()
         return firings
@@ -94,5 +102,6 @@ class FiringRows:
 
 def compile_kernels() -> None:
     """Compile the kernels, or load them from numba's cache, before the first packet arrives."""
-    for mode in (vlp16.STRONGEST, vlp16.DUAL):
-        FiringRows(1).add(bytes(vlp16.RETURN_MODE_AT) + bytes([mode, vlp16.PRODUCT_ID]), 0, 0)
+    form = packet_format("VLP-16")
+    for mode in (STRONGEST, DUAL):
+        FiringRows(form, 1).add(bytes(RETURN_MODE_AT) + bytes([mode, 0]), 0, 0)

@@ -9,8 +9,7 @@ from pydantic import ValidationError
 
 from flow.link import LinkError
 from links.clock import host_time
-from links.velodyne import Lidar
-from links.velodyne.vlp16 import first_pulse_ns
+from links.lidar import Lidar, packet_format
 from tests.links.ports import free_port, send
 
 WIRE_NS = 101_760
@@ -37,9 +36,12 @@ def test_packets_arrive_in_order_as_records_that_decode(port):
 
 
 def test_a_packets_first_pulse_is_its_firing_time_before_its_arrival():
-    assert first_pulse_ns(10_000_000, packet()) == 10_000_000 - SINGLE_PACKET_NS - WIRE_NS
-    assert first_pulse_ns(10_000_000, packet(mode=DUAL)) == 10_000_000 - SINGLE_PACKET_NS // 2 - WIRE_NS
-    assert first_pulse_ns(10_000_000, b"other") == 10_000_000
+    assert packet_format("VLP-16").first_pulse_ns(10_000_000, packet()) == 10_000_000 - SINGLE_PACKET_NS - WIRE_NS
+    assert (
+        packet_format("VLP-16").first_pulse_ns(10_000_000, packet(mode=DUAL))
+        == 10_000_000 - SINGLE_PACKET_NS // 2 - WIRE_NS
+    )
+    assert packet_format("VLP-16").first_pulse_ns(10_000_000, b"other") == 10_000_000
 
 
 def test_packets_from_other_senders_are_ignored_and_counted(port):

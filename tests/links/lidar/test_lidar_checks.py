@@ -7,14 +7,15 @@ import math
 import pytest
 
 from flow.link import Record
+from links.lidar import Lidar, packet_format
+from links.lidar.checks import clock_drift_ppm, lidar_checks
 from links.preflight.check_result import Level
-from links.simulated.sensors.vlp16_packets import encode_position
-from links.velodyne import Lidar, vlp16
-from links.velodyne.checks import clock_drift_ppm, lidar_checks
+from links.simulated.sensors.lidar_packets import encode_position
 from tests.links.preflight.observed import BEGIN_NS, by_name, levels, observe
 from tests.links.preflight.preflight_peers import packet
 
-PACKET_NS = vlp16.packet_ns(vlp16.STRONGEST)
+FORM = packet_format("VLP-16")
+PACKET_NS = FORM.packet_ns("strongest")
 
 
 def packets(count, *, skip=(), mode="strongest", drift=0.0, step_ns=PACKET_NS):
@@ -23,7 +24,7 @@ def packets(count, *, skip=(), mode="strongest", drift=0.0, step_ns=PACKET_NS):
         if k not in skip:
             at_ns = BEGIN_NS + k * step_ns
             data = packet(at_ns - round(drift * k * step_ns), mode)
-            records.append(Record("/lidar/packets", at_ns, vlp16.first_pulse_ns(at_ns, data), data))
+            records.append(Record("/lidar/packets", at_ns, FORM.first_pulse_ns(at_ns, data), data))
     return records
 
 
@@ -33,7 +34,7 @@ def test_a_lidar_that_sends_all_its_packets_passes():
 
 
 def test_a_dual_return_lidar_is_expected_to_send_twice_as_often():
-    dual_ns = vlp16.packet_ns(vlp16.DUAL)
+    dual_ns = FORM.packet_ns("dual")
     assert levels(lidar_checks(observe(Lidar(), packets(800, mode="dual", step_ns=dual_ns))))["rate"] == "ok"
     slow = by_name(lidar_checks(observe(Lidar(), packets(800, mode="dual"))))
     assert slow["rate"].level is Level.FAIL

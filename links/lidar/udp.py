@@ -1,4 +1,4 @@
-"""Live VLP-16 packets from UDP sockets, from one sender, with the kernel's arrival stamps.
+"""Live LiDAR packets from UDP sockets, from one sender, with the kernel's arrival stamps.
 
 Nothing is queued here. Packets that the consumer does not take in time wait in the socket's bounded buffer; when it is
 full the kernel drops them, and the decoder counts them from the gap in device time.
@@ -13,17 +13,17 @@ import select
 import socket
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from flow.link import LinkError, Record
 from links.clock import datagram_time
-from links.velodyne import vlp16
 
+FirstPulse = Callable[[int, bytes], int]  # time of the first pulse from arrival [ns] and payload
 RECEIVE_BUFFER_BYTES = 1 << 20  # 0.6 s of packets, if the host's net.core.rmem_max allows it
-_DATAGRAM_BYTES = 2048
+_DATAGRAM_BYTES = 65_536  # an Ouster's packets are up to 33 kB
 _BURST = 16  # datagrams read per `select`: a call of `select` costs as much as reading a datagram
 _WAKE_S = 0.2  # how often a waiting listener checks whether it was closed
 
@@ -46,19 +46,24 @@ class Channel(NamedTuple):
 
 @contextmanager
 def listen_udp(
-    channels: Sequence[Channel], bind: str, sender: str | None, timeout_s: float, counters: UdpCounters
+    channels: Sequence[Channel],
+    bind: str,
+    sender: str | None,
+    timeout_s: float,
+    counters: UdpCounters,
+    first_pulse_ns: FirstPulse,
 ) -> Iterator[Iterator[Record]]:
     """Open a socket per channel and yield an iterator of records.
 
     Raises LinkError when a socket cannot be opened, or when nothing arrives on the first channel for timeout_s.
-    `record.stamp_ns` is when the packet's first laser fired, estimated from its arrival (`vlp16.first_pulse_ns`).
+    `record.stamp_ns` is when the packet's first laser fired, estimated from its arrival (`first_pulse_ns`).
     The iterator ends when the context is left, also from another thread.
     """
     closed = threading.Event()
     with ExitStack() as stack:
         sockets = {stack.enter_context(_open(bind, channel.port)): channel for channel in channels}
         try:
-            yield _records(sockets, closed, sender, timeout_s, counters)
+            yield _records(sockets, closed, sender, timeout_s, counters, first_pulse_ns)
         finally:
             closed.set()
 
@@ -90,6 +95,7 @@ def _records(
     sender: str | None,
     timeout_s: float,
     counters: UdpCounters,
+    first_pulse_ns: FirstPulse,
 ) -> Iterator[Record]:
     first = next(iter(sockets.values()))
     deadline_s = time.monotonic() + timeout_s
@@ -108,7 +114,7 @@ def _records(
                 counters.last_foreign = host
                 continue
             arrival_ns = datagram_time.arrival_ns(ancillary)
-            stamp_ns = vlp16.first_pulse_ns(arrival_ns, data)
+            stamp_ns = first_pulse_ns(arrival_ns, data)
             yield Record(channel.topic, arrival_ns, stamp_ns, data, counters.received)
             counters.received += 1
             if channel is first:

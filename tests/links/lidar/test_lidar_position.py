@@ -9,8 +9,8 @@ import velodyne_decoder
 from hand_built import captured, packet, record
 
 from flow.link import LinkError
-from links.velodyne import Lidar
-from links.velodyne.position import Pps, parse_position
+from links.lidar import Lidar
+from links.lidar.position import Pps, parse_position
 from tests.links.ports import free_ports, send
 
 GPRMC = "$GPRMC,081802.50,A,3649.7478558,N,00224.4542928,W,0.034,212.5,210116,0.0,E,A*2B"
@@ -176,7 +176,7 @@ def test_with_clock_utc_a_lost_lock_is_reported_until_it_returns_and_packets_are
 
 
 def test_with_clock_utc_the_end_of_position_packets_is_reported(ports, monkeypatch):
-    monkeypatch.setattr("links.velodyne.lidar.POSITION_TIMEOUT_S", 0.15)
+    monkeypatch.setattr("links.lidar.lidar.POSITION_TIMEOUT_S", 0.15)
     lidar = Lidar(port=ports[0], position_port=ports[1], clock="utc", timeout_s=0.15)
     with lidar.listen() as records:
         send(ports[1], position())

@@ -1,4 +1,4 @@
-"""The VLP-16's position packet: GPS time, and whether the sensor's clock is locked to it.
+"""A Velodyne's position packet: GPS time, and whether the sensor's clock is locked to it.
 
 Source: VLP-16 User Manual 63-9243 Rev. E, section 9.3.3, tables 9-3 and 9-4. The manual counts from the Ethernet
 frame's start; the offsets here count from the UDP payload's start (42 bytes less).
@@ -12,7 +12,8 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 
 from flow.link import LinkError
-from links.velodyne import vlp16
+from links.lidar.reject_reason import HOUR_US
+from links.lidar.velodyne import POSITION_BYTES
 
 _TIMESTAMP_AT = 0xF0 - 42
 _PPS_AT = 0xF4 - 42
@@ -83,10 +84,10 @@ class PpsMonitor:
 
 def parse_position(data: bytes) -> Position:
     """Parse a position packet (UDP payload of 512 bytes). Raises LinkError when it is not one."""
-    if len(data) != vlp16.POSITION_BYTES:
-        raise LinkError(f"a position packet has {vlp16.POSITION_BYTES} bytes, this one {len(data)}: is it UDP 8308?")
+    if len(data) != POSITION_BYTES:
+        raise LinkError(f"a position packet has {POSITION_BYTES} bytes, this one {len(data)}: is it UDP 8308?")
     timestamp_us = int.from_bytes(data[_TIMESTAMP_AT : _TIMESTAMP_AT + 4], "little")
-    if timestamp_us >= vlp16.HOUR_US or data[_PPS_AT] > Pps.ERROR.value:
+    if timestamp_us >= HOUR_US or data[_PPS_AT] > Pps.ERROR.value:
         raise LinkError("a position packet with an invalid time or PPS state: is the sender a VLP-16?")
     nmea = data[_NMEA_AT:].split(b"\r", 1)[0].split(b"\0", 1)[0].decode("ascii", errors="replace")
     gps_utc, valid = _read_gprmc(nmea)

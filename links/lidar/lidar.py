@@ -1,11 +1,11 @@
-"""The VLP-16 as a source: UDP packets live, recorded packets in replay, the same decoder for both.
+"""A spinning LiDAR as a source: UDP packets live, recorded packets in replay, the same decoder for both.
 
-Live it can also receive the sensor's position packets: they are recorded on /lidar/position, and their GPS and PPS
+Live it can also receive a Velodyne's position packets: they are recorded on /lidar/position, and their GPS and PPS
 states are counted. With `clock: utc` no data packet is accepted until they report that the sensor's clock is locked to
 UTC. A lock that is lost later is counted and reported; the packets are still accepted, and the sensor's clock drifts by
 a few ppm.
 
-Source: VLP-16 User Manual 63-9243 Rev. E, chapter 9. The handling of damaged, lost and repeated packets is ours.
+Source: the manuals in `stages/geometry/lidar_models.py`. The handling of damaged, lost and repeated packets is ours.
 """
 
 from __future__ import annotations
@@ -21,12 +21,14 @@ from pydantic import Field, model_validator
 
 from flow.counters import Counters
 from flow.link import LinkError, Record, Source, SourceSettings
-from links.velodyne import vlp16
-from links.velodyne.decode import FiringRows, compile_kernels
-from links.velodyne.lidar_clock import ClockMode, LidarClock
-from links.velodyne.position import PpsMonitor
-from links.velodyne.reject_reason import PacketRejectReason, reject_reason, timestamp_us
-from links.velodyne.udp import Channel, UdpCounters, listen_udp
+from links.lidar.decode import FiringRows, compile_kernels
+from links.lidar.formats import AnyFormat, packet_format
+from links.lidar.lidar_clock import ClockMode, LidarClock
+from links.lidar.position import PpsMonitor
+from links.lidar.reject_reason import PacketRejectReason
+from links.lidar.udp import Channel, UdpCounters, listen_udp
+from links.lidar.velodyne import DATA_PORT, POSITION_PORT
+from stages.geometry.rig_lidar import RigLidar
 from stages.messages import LidarFirings
 
 POSITION_TOPIC = "/lidar/position"
@@ -38,14 +40,15 @@ class LidarSettings(SourceSettings):
     """Settings of `Lidar`."""
 
     topic: str = "/lidar/packets"
+    unit: RigLidar = RigLidar()  # model, and an Ouster's beams: $rig.lidar
     clock: ClockMode = "free"  # utc: sensor and host are both locked to UTC
     clock_limit_s: float = Field(0.5, gt=0, le=1800)
     bind: IPv4Address = IPv4Address("127.0.0.1")  # this host's address; 0.0.0.0 for a LiDAR that broadcasts
-    port: int = Field(vlp16.DATA_PORT, ge=1, le=65535)
+    port: int = Field(DATA_PORT, ge=1, le=65535)  # an Ouster sends to 7502
     sender: IPv4Address | None = None  # the LiDAR's address, 192.168.1.201 from the factory
     position_port: int | None = Field(None, ge=1, le=65535)  # 8308 from the factory; None: not received
     timeout_s: float = Field(2.0, gt=0, le=60)
-    packets: int = Field(1, ge=1, le=16)  # per message, 1.3 ms each: fewer messages need less CPU time and add latency
+    packets: int = Field(1, ge=1, le=16)  # per message: fewer messages need less CPU time and add latency
 
     @model_validator(mode="after")
     def _sender_is_known(self) -> LidarSettings:
@@ -58,13 +61,14 @@ class LidarSettings(SourceSettings):
 
 
 class Lidar(Source[LidarSettings]):
-    """One VLP-16 or Puck LITE. Set `sender` (the LiDAR's address) to listen beyond loopback."""
+    """One LiDAR. Set `sender` (the LiDAR's address) to listen beyond loopback."""
 
     def __init__(self, settings: LidarSettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
         settings = self.settings
         clock = LidarClock(settings.clock, round(1e9 * settings.clock_limit_s))
-        self._stream = PacketStream(settings.topic, clock, settings.packets)
+        self.form = packet_format(settings.unit.model, settings.unit.beams)
+        self._stream = PacketStream(settings.topic, clock, self.form, settings.packets)
         self._locked_once: bool = False  # clock: utc, since the start of `listen`: data packets are accepted
         self._position_s: float = 0.0  # arrival of the newest position packet, monotonic
         self._pps = PpsMonitor()
@@ -81,7 +85,7 @@ class Lidar(Source[LidarSettings]):
     def senders(self) -> dict[str, dict[str, str]]:
         """Model, port, and the sensor's address if `sender` is set."""
         settings = self.settings
-        known = {"model": "VLP-16"} | ({} if settings.sender is None else {"sender": str(settings.sender)})
+        known = {"model": settings.unit.model} | ({} if settings.sender is None else {"sender": str(settings.sender)})
         ports = {settings.topic: settings.port} | (
             {} if settings.position_port is None else {POSITION_TOPIC: settings.position_port}
         )
@@ -94,14 +98,15 @@ class Lidar(Source[LidarSettings]):
         compile_kernels()
         if settings.clock == "utc" and settings.position_port is None:
             raise LinkError(
-                f"clock: utc needs the sensor's position packets: set position_port: {vlp16.POSITION_PORT}, or "
-                "clock: free"
+                f"clock: utc needs the sensor's position packets: set position_port: {POSITION_PORT}, or clock: free"
             )
         channels = [Channel(settings.topic, settings.port)]
         if settings.position_port is not None:
             channels.append(Channel(POSITION_TOPIC, settings.position_port))
         sender = None if settings.sender is None else str(settings.sender)
-        with listen_udp(channels, str(settings.bind), sender, settings.timeout_s, self._udp) as records:
+        with listen_udp(
+            channels, str(settings.bind), sender, settings.timeout_s, self._udp, self.form.first_pulse_ns
+        ) as records:
             try:
                 yield self._with_lock_check(records) if settings.position_port is not None else records
             finally:
@@ -166,7 +171,7 @@ class PacketStream:
     A message holds consecutive packets: a gap ends it early.
     """
 
-    def __init__(self, topic: str, clock: LidarClock, packets_per_message: int = 1) -> None:
+    def __init__(self, topic: str, clock: LidarClock, form: AnyFormat, packets_per_message: int = 1) -> None:
         self.clock = clock
         self.decoded = 0
         self.lost = 0
@@ -174,24 +179,24 @@ class PacketStream:
         self._topic = topic
         self._consecutive_rejected = 0
         self._lost_before = 0
-        self._packet_ns = vlp16.packet_ns(vlp16.STRONGEST)
-        self._packets_per_message, self._rows = packets_per_message, FiringRows(packets_per_message)
+        self._form, self._packet_ns = form, form.packet_ns("strongest")
+        self._packets_per_message, self._rows = packets_per_message, FiringRows(form, packets_per_message)
 
     def decode(self, record: Record) -> LidarFirings | None:
         """See `Lidar.decode`."""
-        data = record.data
-        reason = reject_reason(data)
+        data, form = record.data, self._form
+        reason = form.reject_reason(data)
         if reason is not None:
             return self._refuse(reason, data)
-        time_or_reason = self.clock.read(timestamp_us(data), record.stamp_ns)
+        time_or_reason = self.clock.read(form.timestamp_us(data), record.stamp_ns)
         if isinstance(time_or_reason, PacketRejectReason):
             return self._refuse(time_or_reason, data)
         stamp_ns, gap_ns = time_or_reason
         # The previous packet lasted _packet_ns: if this one begins later than its end, packets are missing in between.
         follows = abs(gap_ns - self._packet_ns) <= self._packet_ns // 2 and not self._lost_before
         lost = self._lost_before + max((gap_ns + self._packet_ns // 2) // self._packet_ns - 1, 0)
-        self._packet_ns = vlp16.packet_ns(data[vlp16.RETURN_MODE_AT])
-        rows = self._rows if follows or not self._rows.packets else FiringRows(self._packets_per_message)
+        self._packet_ns = form.duration_ns(data)
+        rows = self._rows if follows or not self._rows.packets else FiringRows(form, self._packets_per_message)
         if not rows.add(data, stamp_ns, lost):
             self._lost_before = lost + 1
             return self._refuse(PacketRejectReason.AZIMUTH, data)
@@ -208,17 +213,18 @@ class PacketStream:
         self.rejected[reason] += 1
         self._consecutive_rejected += 1
         stuck = self._consecutive_rejected % MAX_CONSECUTIVE_REJECTED == 0
-        if reason is PacketRejectReason.MODEL and (self.decoded == 0 or stuck):
-            model = vlp16.other_model(data)
-            if model is not None:
+        model = self._form.profile.model
+        if reason is not PacketRejectReason.POSITION and (self.decoded == 0 or stuck):
+            other = self._form.other_model(data)
+            if other is not None:
                 raise LinkError(
-                    f"{self._topic}: these packets come from a Velodyne {model}; grd supports the VLP-16 and Puck LITE "
-                    f"(0x{vlp16.PRODUCT_ID:02X}). Use a recording of one of those, or check `sender` and `port`."
+                    f"{self._topic}: these packets come from a {other}, the rig's LiDAR is a {model}: set rig.lidar, "
+                    "use another recording, or check `sender` and `port`."
                 )
         if stuck:
             reasons = ", ".join(f"{count} {reason.value}" for reason, count in self.rejected.most_common())
             raise LinkError(
                 f"{self._topic}: {MAX_CONSECUTIVE_REJECTED} consecutive packets are invalid (rejected so far: "
-                f"{reasons}). Is this VLP-16 data (UDP {vlp16.DATA_PORT}, {vlp16.PACKET_BYTES} bytes)? Check "
-                "`sender`, `port` and the sensor's settings."
+                f"{reasons}). Is this {model} data (UDP {self._form.factory_port}, {self._form.packet_bytes} bytes)? "
+                "Check `sender`, `port` and the sensor's settings."
             )

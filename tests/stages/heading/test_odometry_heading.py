@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from stages.geometry.frames import rotation_z
-from stages.heading.odometry_heading import OdometryHeading, OdomYaw
+from stages.heading.inertial_bank import YawMixture
+from stages.heading.odometry_heading import OdometryHeading, OdomYaw, YawEvidence
 
 S = 1_000_000_000
 COMPASS_RAD = math.radians(7.0)
@@ -129,18 +130,21 @@ def test_the_body_s_yaw_has_the_compass_s_error_and_outliers():
     evidence = odometry.evidence(8 * S, rotation_z(0.5))
     assert off_rad(evidence.yaw_rad, TRUE_RAD + 0.5) < 0.1
     assert evidence.sigma_rad == pytest.approx(math.hypot(COMPASS_RAD, odometry._fit.sigma_rad))
-    yaws = TRUE_RAD + 0.5 + np.array([0.0, COMPASS_RAD, math.pi])
-    best, near, wrong = evidence.log_density(yaws, np.zeros(3))
-    assert best > near > wrong
-    assert wrong == pytest.approx(math.log(0.03), abs=1e-3)  # relative to a uniform density
+    flat = YawMixture(np.linspace(-math.pi, math.pi, 25)[1:], np.full(24, 0.15**2), np.full(24, 1.0 / 24))
+    with_compass = evidence.applied(flat)
+    assert with_compass.weight.sum() == pytest.approx(1.0)
+    assert with_compass.weight[24:].sum() == pytest.approx(0.03, rel=0.1)  # the compass is wrong by any angle
+    best = int(np.argmax(with_compass.weight))
+    assert off_rad(float(with_compass.yaw_rad[best]), TRUE_RAD + 0.5) < 2.0 * evidence.sigma_rad
+    assert with_compass.variance_rad2[best] < evidence.sigma_rad**2
 
 
-def test_the_density_of_the_body_s_yaw_integrates_to_one():
-    odometry = heading()
-    fly(odometry, times(0, 8))
-    yaws = np.linspace(-math.pi, math.pi, 2001)[1:]
-    density = np.exp(odometry.evidence(8 * S, np.eye(3)).log_density(yaws, np.zeros(2000)))
-    assert density.mean() == pytest.approx(1.0, abs=1e-3)
+def test_a_yaw_that_contradicts_the_compass_keeps_its_value_and_the_compass_is_the_outlier():
+    prior = YawMixture(np.array([TRUE_RAD + math.pi]), np.array([0.01]), np.array([1.0]))
+    after = YawEvidence(TRUE_RAD, COMPASS_RAD, 0.03).applied(prior)
+    assert after.weight[1] > 0.999
+    assert after.yaw_rad[1] == prior.yaw_rad[0]
+    assert after.variance_rad2[1] == prior.variance_rad2[0]
 
 
 def test_the_evidence_ends_with_the_fit():

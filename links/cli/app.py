@@ -14,12 +14,11 @@ from links.cli.calibrate import calibrate_recording
 from links.cli.console import out
 from links.cli.evaluate import evaluate_runs
 from links.cli.files import import_recording, recover_recording, view
-from links.cli.flights import fly_scenarios
 from links.cli.graphs import check, graph, schema
 from links.cli.lens import import_lens
 from links.cli.preflight import preflight
 from links.cli.run import replay_recording, run
-from links.cli.simulate import simulate_matrix, simulate_recording
+from links.cli.simulate import fly_scenarios, simulate_matrix, simulate_recording
 from links.cli.verify import verify
 
 app = typer.Typer(

@@ -153,7 +153,7 @@ class OdometryHeading:
         if precision * LEAST_M**2 < 1.0 or float(np.ptp(x, axis=0).max()) < LEAST_M:
             return None
         z_level, x_level = z[:, 0] + 1j * z[:, 1], x[:, 0] + 1j * x[:, 1]
-        a = complex(np.vdot(W @ x_level, z_level)) / precision
+        a: complex = np.vdot(W @ x_level, z_level).item() / precision
         left = z_level - z_level.mean() - a * (x_level - x_level.mean())
         chi2 = complex(np.vdot(left, W @ left)).real
         if abs(abs(a) - 1.0) > LENGTH_SLACK or chi2 > WORST_CHI2 * 2 * (len(points) - 2):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import yaml
 
-from flow.config_error import ConfigError, Location
+from flow.config_error import ConfigError
 from flow.graph import load_graph
 from flow.link import LinkError, Record, Tap
 from flow.message import Message
@@ -80,7 +80,7 @@ class Goals(Tap):
 def replayed(records: list[Record], scenario: Scenario, config: FilePath) -> tuple[str, list[tuple[int, float]]]:
     """Output hash and goals of an open-loop replay."""
     digest, goals = Digest(), Goals()
-    graph = load_graph(config, sections={"rig": (yaml.safe_load(scenario.rig_yaml()), Location("test", 0))})
+    graph = load_graph(config, sections={"rig": (scenario.rig_yaml(), "test")})
     replay(graph, [r for r in records if not r.topic.startswith("/truth")], (digest, goals))
     return digest.hexdigest(), goals._seen
 

@@ -9,9 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 
-from flow.config_error import Location
 from flow.graph import load_graph
 from flow.link import LinkError, Record, Tap
 from flow.message import Message
@@ -114,7 +112,7 @@ def test_records_are_in_order_of_arrival_and_the_outcome_is_the_last(flown) -> N
 
 def test_a_replay_of_the_recording_takes_the_same_steps(flown) -> None:
     records, simulation, output_hash = flown
-    rig = yaml.safe_load(simulation.scenario.rig_yaml()), Location("test", 0)
+    rig = simulation.scenario.rig_yaml(), "test"
     digest = Digest()
     received = [r for r in records if not r.topic.startswith("/truth")]
     replay(load_graph(CONFIG, sections={"rig": rig}), received, (digest,))

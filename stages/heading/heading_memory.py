@@ -1,7 +1,9 @@
 """The state of a drone that was lost, so that its heading is one hypothesis when a drone is found.
 
-Source: ours; the probabilities are of the same kind as the decision's: below the threshold, so that a remembered
-heading alone never decides.
+At the propagated position it is the same drone, and its heading is decided again; elsewhere it may be another one, and
+the remembered heading alone does not decide.
+
+Source: ours.
 """
 
 from __future__ import annotations

@@ -155,7 +155,7 @@ class OdometryHeading:
         z_level, x_level = z[:, 0] + 1j * z[:, 1], x[:, 0] + 1j * x[:, 1]
         a: complex = np.vdot(W @ x_level, z_level).item() / precision
         left = z_level - z_level.mean() - a * (x_level - x_level.mean())
-        chi2 = complex(np.vdot(left, W @ left)).real
+        chi2 = float(left.real @ W @ left.real + left.imag @ W @ left.imag)
         if abs(abs(a) - 1.0) > LENGTH_SLACK or chi2 > WORST_CHI2 * 2 * (len(points) - 2):
             return None
         sigma = max(1.0 / math.sqrt(precision), abs(abs(a) - 1.0))  # the error of a, seen along it, is as large across

@@ -27,7 +27,6 @@ from flow.taps import Digest
 from links.recording import Progress, Session
 from links.runs.request import RunRequest, RunResult
 from links.runs.run_folder import RunFolder, read_truth_file
-from links.viewer import Viewer
 
 PACKAGES = ("stages", "links")  # whose classes the configuration of a recording may name
 SECTIONS = ("rig", "stages", "links")
@@ -103,6 +102,8 @@ def _graph_of(session: Session, trusted: bool) -> tuple[Graph, RunRequest]:
         config.write_text(yaml.safe_dump(values, sort_keys=False), encoding="utf-8")
         graph = load_graph(config, packages=None if trusted else PACKAGES)
     if not trusted:
+        from links.viewer import Viewer  # imports Rerun
+
         taps = {name for name, spec in graph.nodes.items() if issubclass(spec.cls, Tap) and spec.cls is not Viewer}
         graph = graph.restricted_to(graph.nodes.keys() - taps)
     return graph, RunRequest(config)

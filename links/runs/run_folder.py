@@ -31,8 +31,6 @@ from links.runs.results import SUMMARY_FILE, Results
 from links.runs.summary import summary
 from links.runs.truth import TruthLog, read_truth_file
 from links.runs.usage import Usage
-from links.viewer import Viewer
-from links.viewer.scene import Gate
 from stages.messages import Detections, DroneFix, RelativePose
 
 CONFIG_FILE = "config.yaml"
@@ -63,9 +61,7 @@ class RunFolder:
         self._results, self._open = Results(**gate), ExitStack()
         declared = [spec.build() for spec in graph.nodes.values() if issubclass(spec.cls, Tap)]
         self.taps: list[Tap] = [self._results, *(tap for tap in declared if isinstance(tap, Tap))]
-        self._viewers = [tap for tap in self.taps if isinstance(tap, Viewer)]
-        for viewer in self._viewers:
-            viewer.gate = Gate(**gate) if gate else None
+        self._viewers = _viewers(self.taps, gate)
 
     def __enter__(self) -> RunFolder:
         self._folder.mkdir(parents=True, exist_ok=True)
@@ -147,6 +143,19 @@ def _stage_outputs(graph: Graph, report: RunReport) -> str:
             return ""
         counts[node].append(f"{report.messages.get(f'{node}.{output}', 0)} {output}")
     return "; ".join(f"{n} ({graph.nodes[n].cls.__name__}: {', '.join(c) or 'no output'})" for n, c in counts.items())
+
+
+def _viewers(taps: list[Tap], gate: dict[str, Any]) -> list[Any]:
+    """The viewers among the taps, with the gate's settings. Rerun is imported only where a graph has taps."""
+    if len(taps) == 1:
+        return []
+    from links.viewer import Viewer
+    from links.viewer.scene import Gate
+
+    viewers = [tap for tap in taps if isinstance(tap, Viewer)]
+    for viewer in viewers:
+        viewer.gate = Gate(**gate) if gate else None
+    return viewers
 
 
 def _gate(graph: Graph) -> dict[str, Any]:

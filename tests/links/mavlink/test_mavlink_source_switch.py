@@ -296,7 +296,7 @@ def test_a_flight_is_switched_to_grd_and_back_to_gps_when_the_lidar_ends(tmp_pat
     assert scenario.autopilot is not None
     autopilot = scenario.autopilot.model_dump()
     autopilot["flight_stack"]["plan"] = [{"do": "path", "for_s": 60}]
-    scenario = scenario.changed(duration_s=15.0, autopilot=autopilot, lidar_gaps_s=((13.0, 15.0),))
+    scenario = scenario.changed(duration_s=27.0, autopilot=autopilot, lidar_gaps_s=((21.0, 27.0),))
     simulation = Simulation(scenario, loop=load_loop(config, scenario.rig_yaml(), "test", scenario.closed_loop))
     for _ in simulation.records():
         pass

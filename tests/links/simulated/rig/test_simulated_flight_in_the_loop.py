@@ -61,9 +61,9 @@ def fly(scenario: Scenario, *taps: Tap) -> tuple[list[Record], Simulation, str]:
 
 @pytest.fixture(scope="module")
 def flown() -> tuple[list[Record], Simulation, str]:
-    """12 s: grd finds the heading and sends; the switch is at 9 s."""
-    plan = [{"do": "path", "for_s": 9}, {"do": "use_sources", "set": 2}, {"do": "hold", "for_s": 40}]
-    return fly(changed(load_scenario(FLIGHT), 12.0, {"plan": plan}))
+    """17 s: grd learns the yaw of the autopilot's axes and sends; the switch is at 14 s."""
+    plan = [{"do": "path", "for_s": 14}, {"do": "use_sources", "set": 2}, {"do": "hold", "for_s": 40}]
+    return fly(changed(load_scenario(FLIGHT), 17.0, {"plan": plan}))
 
 
 def messages(records: list[Record], topic: str, kind: str) -> list[tuple[Record, Any]]:
@@ -83,9 +83,9 @@ def test_sent_poses_reach_the_autopilot_and_it_flies_on_them(flown) -> None:
 def test_the_session_does_what_it_does_live_at_its_times(flown) -> None:
     """HEARTBEAT at 1 Hz, TIMESYNC at 4 Hz; replies to ours are stamped with the time of the request."""
     records, _, _ = flown
-    assert len(messages(records, "/autopilot/tx", "HEARTBEAT")) == pytest.approx(12, abs=2)
+    assert len(messages(records, "/autopilot/tx", "HEARTBEAT")) == pytest.approx(17, abs=2)
     asked = [m.ts1 for _, m in messages(records, "/autopilot/tx", "TIMESYNC") if m.tc1 == 0]
-    assert len(asked) == pytest.approx(48, abs=4)
+    assert len(asked) == pytest.approx(68, abs=5)
     replies = [(r, m) for r, m in messages(records, "/autopilot/rx", "TIMESYNC") if m.tc1 != 0]
     assert len(replies) > 40
     assert all(record.stamp_ns == message.ts1 and message.ts1 in asked for record, message in replies)
@@ -152,18 +152,18 @@ def test_a_gap_of_the_lidar_stops_the_fixes() -> None:
 
 
 def test_after_a_kill_grd_starts_anew_and_the_flight_goes_on() -> None:
-    scenario = changed(load_scenario(FLIGHT), 12.0, {"plan": [{"do": "path", "for_s": 20}]})
-    scenario = scenario.changed(closed_loop={"killed_s": (8.0, 9.0)})
+    scenario = changed(load_scenario(FLIGHT), 17.0, {"plan": [{"do": "path", "for_s": 20}]})
+    scenario = scenario.changed(closed_loop={"killed_s": (13.0, 14.0)})
     positions = Positions()
     records, simulation, _ = fly(scenario, positions)
     start_ns = scenario.start_ns
     sent_s = np.array([(r.arrival_ns - start_ns) * 1e-9 for r in records if r.topic == "/autopilot/tx"])
-    assert not ((sent_s > 8.05) & (sent_s < 9.0)).any()
-    assert (sent_s > 9.0).any()
+    assert not ((sent_s > 13.05) & (sent_s < 14.0)).any()
+    assert (sent_s > 14.0).any()
     first_ns = min(r.arrival_ns for r, _ in messages(records, "/autopilot/tx", "ODOMETRY"))
-    assert first_ns < start_ns + 8e9
+    assert first_ns < start_ns + 13e9
     assert all(independent == (at_ns < first_ns) for at_ns, independent in positions.seen if at_ns != first_ns)
-    assert positions.seen[-1][0] > start_ns + 11e9
+    assert positions.seen[-1][0] > start_ns + 16e9
     counters = {m.reset_counter for _, m in messages(records, "/autopilot/tx", "ODOMETRY")}
     assert counters
     assert not stack_of(simulation).quadrotor.crashed
@@ -171,7 +171,7 @@ def test_after_a_kill_grd_starts_anew_and_the_flight_goes_on() -> None:
 
 @pytest.mark.parametrize(
     ("config", "flight", "killed_s"),
-    [("sim_flight_inertial_fixes", "hover_yaw_fixes", (14.0, 15.0)), ("sim_flight_fixes", "hover_fixes", (9.0, 10.0))],
+    [("sim_flight_inertial_fixes", "hover_yaw_fixes", (14.0, 15.0)), ("sim_flight_fixes", "hover_fixes", (14.0, 15.0))],
 )
 def test_after_a_kill_with_a_state_file_poses_are_sent_again_within_5_s(
     config: str, flight: str, killed_s: tuple[float, float], tmp_path: Path

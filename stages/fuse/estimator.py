@@ -1,8 +1,7 @@
 """Estimate of the drone by IMU: a bank of yaw hypotheses until the heading is decided, then a factor graph.
 
-Measurements are used in order of time, up to the horizon: the time up to which the motions of drone and vehicle are
-measured. The published state is propagated from the horizon by the IMU. A measurement that arrives after the horizon
-has passed its time is moved to the horizon.
+Measurements are used in order of time, up to the horizon (measurement_queue.py). The published state is propagated from
+the horizon by the IMU. A measurement that arrives after the horizon has passed its time is moved to the horizon.
 
 The heading of a lost drone is remembered and propagated by the gyroscope: it is one hypothesis when a drone is found.
 
@@ -11,46 +10,34 @@ Source: ours; DESIGN, Fusion.
 
 from __future__ import annotations
 
-import heapq
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
 from stages.fuse.consistency import InformationInflation, Rejected, inflation
+from stages.fuse.fix_covariance import FixCovariance, fix_covariance
 from stages.fuse.graph import InertialGraph
+from stages.fuse.measurement_queue import Measurement, MeasurementQueue
 from stages.fuse.settings import FuseErrors
 from stages.geometry.frames import Array64
-from stages.geometry.se3 import mahalanobis2
+from stages.geometry.se3 import CHI2_999_3, mahalanobis2
 from stages.geometry.trajectory import VehicleTrajectory
 from stages.heading import bank_measurements as measure
 from stages.heading.autopilot_samples import AutopilotSamples
 from stages.heading.earlier_run import EarlierRun
 from stages.heading.heading_memory import HeadingMemory
 from stages.heading.imu_buffer import ImuBuffer
-from stages.heading.inertial_bank import InertialBank
 from stages.heading.inertial_heading import InertialHeading, bias_free_turn, turn_between
-from stages.heading.inertial_state import POSITION, THETA, VELOCITY, InertialState, log_rotations
+from stages.heading.inertial_state import POSITION, THETA, InertialState
 from stages.heading.odometry_heading import OdometryHeading, OdomYaw
 from stages.heading.ownership import Ownership, log_evidence
 from stages.messages import DroneFix, DroneMotion, RelativeRotation, VisualMotion
 
-DELAY_NS = 100_000_000  # measurements arrive at most this long after their stamp
-GATE = 16.27  # chi-square, 3 degrees of freedom, 99.9 %
 TILT_TIME_S = 20.0  # time constant of the error of roll and pitch
 KEPT_NS = 15_000_000_000  # without a LiDAR position the estimate ends; the heading is remembered
-VEHICLE_NS, WAIT_NS = 60_000_000, 350_000_000  # extrapolation of the vehicle's pose; longest wait for a newer one
-IMAGE_NS = 300_000_000  # without an IMU, longest wait for the drone's next image
 FREE_NS = 1_000_000_000  # without IMU and vanishing points the yaw is dropped after this time
-Measurement = DroneFix | RelativeRotation | VisualMotion
-
-
-@dataclass(frozen=True)
-class FixCovariance:
-    """Error of a LiDAR position, map axes [m2]: white, and a bias that does not average out."""
-
-    white: Array64
-    bias: Array64
+LATEST_NS = 500_000_000  # a measurement that is older than the state by more is not used
+LATE_MPS2 = 1.5  # change of velocity that moving a late position to the state's time ignores
 
 
 class Estimator:
@@ -67,8 +54,7 @@ class Estimator:
         self._autopilot = AutopilotSamples()
         self._memory = HeadingMemory(self.imu)
         self.earlier = EarlierRun(errors.changed_frames)
-        self._waiting: list[tuple[int, int, Measurement]] = []
-        self._count = 0
+        self._queue = MeasurementQueue(self.imu, vehicle)
         self.resets, self.too_late = 0, 0
         self.fix_ns: int | None = None  # newest LiDAR position used
         self.newest_fix_ns: int | None = None  # also when the drone is lost
@@ -97,14 +83,12 @@ class Estimator:
         """Add a measurement; it is used when the horizon reaches its time."""
         if isinstance(measurement, VisualMotion):
             self.imu.add_visual_motion(measurement)
-        self._count += 1
-        heapq.heappush(self._waiting, (measurement.stamp_ns, self._count, measurement))
+        self._queue.add(measurement)
 
     def pass_time(self, now_ns: int) -> None:
         """Move the horizon and use the measurements before it."""
-        horizon_ns = self._horizon_ns(now_ns)
-        while self._waiting and self._waiting[0][0] <= horizon_ns:
-            _, _, measurement = heapq.heappop(self._waiting)
+        horizon_ns = self._queue.horizon_ns(now_ns)
+        for measurement in self._queue.until(horizon_ns):
             if isinstance(measurement, DroneFix):
                 self._use_fix(measurement)
             elif isinstance(measurement, RelativeRotation):
@@ -114,19 +98,6 @@ class Estimator:
         self._advance(horizon_ns)
         if self.fix_ns is not None and now_ns - self.fix_ns > KEPT_NS:
             self.lose()
-
-    def _horizon_ns(self, now_ns: int) -> int:
-        """Time up to which the motion of the drone and of the vehicle is measured."""
-        newest_ns, image_ns = self.imu.newest_ns, self.imu.newest_image_ns
-        horizon_ns = now_ns
-        if newest_ns is not None and self.imu.is_current(now_ns):
-            horizon_ns = min(newest_ns, now_ns - DELAY_NS)
-        elif image_ns is not None and now_ns - image_ns < IMAGE_NS:
-            horizon_ns = min(image_ns, now_ns)
-        vehicle_ns = self._vehicle.newest_ns if self._vehicle.known_at(now_ns) else None
-        if vehicle_ns is not None:
-            horizon_ns = min(horizon_ns, max(vehicle_ns + VEHICLE_NS, now_ns - WAIT_NS))
-        return horizon_ns
 
     # state
 
@@ -144,7 +115,7 @@ class Estimator:
     @property
     def decided(self) -> bool:
         """Whether the heading is known."""
-        return self.graph.running or (self.heading.decided and self.is_own)
+        return self.graph.running or self.heading.decided
 
     @property
     def is_own(self) -> bool:
@@ -189,7 +160,7 @@ class Estimator:
     def start_map(self) -> None:
         """Another map frame begins: drop everything, also what waits for its time."""
         self.forget()
-        self._waiting.clear()
+        self._queue.clear()
         self.imu.clear()
 
     def _drop(self) -> None:
@@ -218,62 +189,43 @@ class Estimator:
         self.heading.resume(self.graph.stamp_ns, self.graph.state)
         self.graph.stop()
 
-    def fix_covariance(self, fix: DroneFix, R_map_vehicle: Array64) -> FixCovariance:
-        """Error of a LiDAR position, map axes."""
-        e = self._errors
-        whole = e.fix_variance * fix.covariance_m2
-        bias = e.fix_bias_share * whole
-        if fix.bias_covariance_m2 is not None:
-            bias = fix.bias_covariance_m2
-            whole = bias + e.fix_variance * (fix.covariance_m2 - bias)
-        R, ahead = R_map_vehicle, np.zeros((3, 3))
-        if self._vehicle.known_at(fix.stamp_ns):  # otherwise the vehicle frame serves as the map frame
-            ahead = self._vehicle.extrapolation_covariance_m2(fix.stamp_ns, fix.xyz_vehicle_m)
-        return FixCovariance(R @ (whole - bias + ahead) @ R.T, R @ bias @ R.T)
-
     def _use_fix(self, fix: DroneFix) -> None:
         stamp_ns = fix.stamp_ns
         if not self._vehicle.in_current_frame(stamp_ns):
             return
         R_map_vehicle, t = self._vehicle.at(stamp_ns)
-        z, covariance = R_map_vehicle @ fix.xyz_vehicle_m + t, self.fix_covariance(fix, R_map_vehicle)
+        z, covariance = R_map_vehicle @ fix.xyz_vehicle_m + t, fix_covariance(fix, self._vehicle, self._errors)
         self.newest_fix_ns = max(stamp_ns, self.newest_fix_ns or stamp_ns)
-        whole_m2 = covariance.white + covariance.bias
         if self.odometry.odom_yaw is None:
-            self.odometry.start(self.earlier.odom_yaw(stamp_ns, z, whole_m2))
-        earlier = self.earlier.heading(stamp_ns, z, whole_m2, self.known and self.decided)
+            self.odometry.start(self.earlier.odom_yaw(stamp_ns, z, covariance.whole))
+        earlier = self.earlier.heading(stamp_ns, z, covariance.whole, self.known and self.decided)
         if not self.known or earlier is not None:
             self._find(fix, z, covariance, earlier)
             return
-        late_s = max(self.stamp_ns - stamp_ns, 0) * 1e-9
-        if late_s > 0.5:
+        late_ns = max(self.stamp_ns - stamp_ns, 0)
+        if late_ns > LATEST_NS:
             self.too_late += 1
             return
+        late_s = late_ns * 1e-9
         state = self._at_horizon(stamp_ns)
         v = state.velocity_mps[0]
         noise = covariance.white * self._fix_inflation.factor(stamp_ns) + (self._errors.clock_s**2) * np.outer(v, v)
         measured, z = z, z + late_s * v
-        noise = noise + (0.75 * late_s**2) ** 2 * np.eye(3)
+        noise = noise + (0.5 * LATE_MPS2 * late_s**2) ** 2 * np.eye(3)
         off = z - state.xyz_m[0]
         nis = mahalanobis2(off, state.covariance[0, POSITION, POSITION] + noise)
-        if nis > GATE and self._rejected.add(stamp_ns, off, noise):
+        if nis > CHI2_999_3 and self._rejected.add(stamp_ns, off, noise):
             self.forget()
             self._find(fix, z, covariance)
             return
-        if nis <= GATE:
+        if nis <= CHI2_999_3:
             self._rejected.clear()
             self._add_odometry(stamp_ns, measured, float(noise[0, 0] + noise[1, 1]) / 2)
         if self.graph.running:
             used = self._add_to_graph(max(stamp_ns, self.stamp_ns), z, noise, nis, state)
         else:
-            used = nis <= GATE
-            self.heading.advance(stamp_ns)
-            self._add_vertical(self.heading.stamp_ns)
-            self.heading.add_position(self.heading.stamp_ns, z, noise)
-            assert self.heading.bank is not None
-            self._add_ownership(stamp_ns, z, noise, self.heading.position_evidence)
-            if self.known and self.decided and self.imu.is_current(stamp_ns):
-                self._start_graph()
+            used = nis <= CHI2_999_3
+            self._add_to_bank(stamp_ns, z, noise)
         if used and self.known:
             self.nis, self.fix_ns = nis, max(stamp_ns, self.fix_ns or stamp_ns)
             self.bias_covariance_m2 = covariance.bias
@@ -288,7 +240,7 @@ class Estimator:
 
     def _add_to_graph(self, stamp_ns: int, z: Array64, noise: Array64, nis: float, predicted: InertialState) -> bool:
         """Add a LiDAR position to the graph, unless it is rejected. Whether it is in the estimate."""
-        used = nis <= GATE and self.graph.add_position(stamp_ns, z, noise, predicted)
+        used = nis <= CHI2_999_3 and self.graph.add_position(stamp_ns, z, noise, predicted)
         if not used:
             self.graph.advance(stamp_ns)
         self._add_vertical(self.graph.stamp_ns)
@@ -296,7 +248,18 @@ class Estimator:
         self._add_ownership(stamp_ns, z, noise, log_evidence(off, predicted.covariance[0, POSITION, POSITION] + noise))
         return used
 
-    def _add_ownership(self, stamp_ns: int, z: Array64, noise: Array64, evidence: float) -> None:
+    def _add_to_bank(self, stamp_ns: int, z: Array64, noise: Array64) -> None:
+        """Add a LiDAR position to the bank; the graph starts when the heading is decided."""
+        self.heading.advance(stamp_ns)
+        self._add_vertical(self.heading.stamp_ns)
+        self._add_ownership(stamp_ns, z, noise, self.heading.add_position(z, noise))
+        self.heading.decide(self.is_own)
+        if self.decided and self.imu.is_current(stamp_ns):
+            self.graph.start(self.heading.stamp_ns, self.heading.decision())
+            if self.graph.running:
+                self.heading.stop()
+
+    def _add_ownership(self, stamp_ns: int, z: Array64, noise: Array64, evidence: float | None) -> None:
         """Whether the object is the drone; the estimate of another one ends, and nothing is published until it is."""
         self.ownership.add(stamp_ns, z, noise, evidence if self.imu.is_current(stamp_ns) else None)
         if self.ownership.cleared:
@@ -304,11 +267,6 @@ class Estimator:
         if self.ownership.denied if self.graph.running else self.ownership.excluded:
             self.suspect = True
             self.forget()
-
-    def _start_graph(self) -> None:
-        self.graph.start(self.heading.stamp_ns, self.heading.decision())
-        if self.graph.running:
-            self.heading.stop()
 
     def _find(
         self, fix: DroneFix, z: Array64, covariance: FixCovariance, earlier: tuple[float, float, float] | None = None
@@ -320,9 +278,9 @@ class Estimator:
         up = self._autopilot.up_drone(fix.stamp_ns)
         self._restart_filters()
         self.odometry.on_found()
-        memory = earlier or self._memory.yaw(fix.stamp_ns, z, covariance.white + covariance.bias)
+        memory = earlier or self._memory.yaw(fix.stamp_ns, z, covariance.whole)
         level = np.array([0.0, 0.0, 1.0]) if up is None else up
-        self.heading.start(fix.stamp_ns, z, covariance.white + covariance.bias, velocity, level, memory)
+        self.heading.start(fix.stamp_ns, z, covariance.whole, velocity, level, memory)
         self.fix_ns, self.bias_covariance_m2 = fix.stamp_ns, covariance.bias
 
     def _add_vertical(self, stamp_ns: int) -> None:
@@ -362,22 +320,19 @@ class Estimator:
             if (self.heading.add_rotation(stamp_ns, R, R_map_vehicle, factor * white) or 0.0) > 0.5:
                 self._rotation_used(rotation)
             return
-        if abs(stamp_ns - self.graph.stamp_ns) > 500_000_000:
+        if abs(stamp_ns - self.graph.stamp_ns) > LATEST_NS:
             self.too_late += 1
             return
         graph = self.graph
         dR, variance = turn_between(self.imu, stamp_ns, graph.stamp_ns, graph.state.bias[0])
         covariance = dR.T @ (factor * white) @ dR + variance * np.eye(3)
-        one = InertialBank(graph.state, np.zeros(1))
-        off = measure.nearest_quarter(one, R @ dR, R_map_vehicle)[0]
-        if mahalanobis2(off, graph.state.covariance[0, THETA, THETA] + covariance) > GATE:
+        off, nearest = (part[0] for part in measure.nearest_quarter(graph.state.R, R @ dR, R_map_vehicle))
+        if mahalanobis2(off, graph.state.covariance[0, THETA, THETA] + covariance) > CHI2_999_3:
             if self._rejected_rotations.add(stamp_ns, off, covariance):
                 self.forget()
             return
         self._rejected_rotations.clear()
-        quarters = R_map_vehicle @ measure.QUARTERS @ R_map_vehicle.T @ (R @ dR)
-        turns = log_rotations(graph.state.R.transpose(0, 2, 1) @ quarters)
-        if graph.add_rotation(quarters[int(np.argmin(np.linalg.norm(turns, axis=1)))], covariance):
+        if graph.add_rotation(nearest, covariance):
             self._rotation_used(rotation)
 
     def _rotation_used(self, rotation: RelativeRotation) -> None:
@@ -394,7 +349,3 @@ class Estimator:
         if turn is not None:
             rate, by_images, covariance = turn
             self.graph.add_gyro_bias(rate - by_images, math.sqrt(float(np.trace(covariance)) / 3))
-
-    def velocity(self, state: InertialState) -> tuple[Array64, Array64]:
-        """Velocity over ground (3,), map axes, and its covariance."""
-        return state.velocity_mps[0], state.covariance[0, VELOCITY, VELOCITY]

@@ -35,7 +35,7 @@ from stages.fuse.settings import FuseErrors, FuseLimits
 from stages.fuse.status import state_of, undecided_reason
 from stages.fuse.track_continuity import TrackContinuity
 from stages.geometry.frames import Array64, heading_rad
-from stages.heading.inertial_state import POSITION, InertialState, yaw_sigma_rad
+from stages.heading.inertial_state import POSITION, VELOCITY, InertialState, yaw_sigma_rad
 from stages.messages import (
     DroneFix,
     DroneMotion,
@@ -199,7 +199,7 @@ class Fuse(Stage[FuseSettings]):
         state = e.at(now_ns)
         R, P = state.R[0], state.covariance[0]
         whole = np.zeros((6, 6))
-        velocity = e.velocity(state)
+        velocity = state.velocity_mps[0], P[VELOCITY, VELOCITY]
         if e.decided:
             axes = np.eye(6)
             axes[3:, 3:] = R.T  # position in drone axes

@@ -13,7 +13,7 @@ import math
 import numpy as np
 
 from stages.geometry.frames import Array64
-from stages.geometry.se3 import mahalanobis2
+from stages.geometry.se3 import CHI2_999_3, mahalanobis2
 from stages.heading.imu_buffer import ImuBuffer
 from stages.heading.inertial_state import POSITION, InertialState
 
@@ -21,7 +21,6 @@ KEPT_NS = 120_000_000_000
 SAME_NS = 15_000_000_000  # so long the propagated position identifies the drone
 SAME_DRONE, MAYBE_ANOTHER = 0.9995, 0.9  # probability that the remembered heading holds
 WIDEST_RAD = math.radians(20.0)
-GATE = 16.27  # chi-square, 3 degrees of freedom, 99.9 %
 
 
 class HeadingMemory:
@@ -52,5 +51,5 @@ class HeadingMemory:
         if sigma > WIDEST_RAD:
             return None
         S = covariance_m2 + state.covariance[0, POSITION, POSITION]
-        same = mahalanobis2(xyz_map_m - state.xyz_m[0], S) <= GATE and stamp_ns - kept_ns < SAME_NS
+        same = mahalanobis2(xyz_map_m - state.xyz_m[0], S) <= CHI2_999_3 and stamp_ns - kept_ns < SAME_NS
         return float(state.yaw_rad[0]), sigma, SAME_DRONE if same else MAYBE_ANOTHER

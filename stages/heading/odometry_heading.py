@@ -26,7 +26,7 @@ from stages.heading.inertial_bank import YawMixture
 
 APART_NS = 150_000_000
 WINDOW_NS = 10_000_000_000
-LEAST_POINTS, LEAST_M = 4, 1.0
+LEAST_POINTS, LEAST_M = 8, 1.0
 FIX_FLOOR_M = 0.05
 DRIFT_MPS = 0.12  # error of the odometry's velocity, constant over the window, one axis
 WANDER_M, WANDER_S = 0.1, 2.0  # of its position, by the noise of GPS, one axis, and time constant

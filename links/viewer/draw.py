@@ -40,6 +40,7 @@ from stages.messages import (
     DroneFix,
     DroneMotion,
     FollowedFeatures,
+    HeadingEstimate,
     Image,
     LidarFirings,
     RelativePose,
@@ -90,6 +91,7 @@ draw.register(FollowedFeatures)(draw_cameras.followed_features)
 draw.register(RelativeRotation)(draw_pose.relative_rotation)
 draw.register(VisualMotion)(draw_pose.visual_motion)
 draw.register(RelativePose)(draw_pose.relative_pose)
+draw.register(HeadingEstimate)(draw_pose.heading_estimate)
 draw.register(AutopilotEstimator)(draw_pose.autopilot_estimator)
 draw.register(ServoOffset)(draw_pose.servo_offset)
 

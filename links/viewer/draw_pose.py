@@ -34,6 +34,7 @@ from stages.messages import (
     AutopilotEstimator,
     BranchState,
     CameraMount,
+    HeadingEstimate,
     PoseEstimate,
     PoseState,
     PositionEstimate,
@@ -167,6 +168,21 @@ def position_covariance_vehicle_m2(estimate: PositionEstimate | PoseEstimate) ->
     if isinstance(estimate, PoseEstimate):
         return estimate.R_vehicle_drone @ estimate.covariance[3:, 3:] @ estimate.R_vehicle_drone.T
     return estimate.covariance_vehicle_m2
+
+
+def heading_estimate(message: HeadingEstimate, name: str, scene: ViewerScene) -> Entities:
+    """The most probable yaw, its probability and sigma, and whether the heading is decided."""
+    state = "decided" if message.decided else "not decided"
+    yield from state_change(f"states/{stage_of(name)}_heading", state, scene)
+    if scene.changed(f"log/{name}", message.reason):
+        yield log_entry(name, message.reason)
+    if len(message.yaw_map_rad):
+        yaw_deg = math.degrees(math.remainder(float(message.yaw_vehicle_rad[0]), 2 * math.pi))
+        sigma_deg, near = math.degrees(message.sigma_rad[0]), 100.0 * message.near_probability
+        z = colours.AXES[2:]
+        yield plot(f"plots/rotation/{name}", [yaw_deg], ["most probable yaw"], z)
+        yield plot(f"plots/rotation_sigma/{name}", [sigma_deg], ["sigma of the most probable yaw"], z)
+        yield plot(f"plots/branch/{name}", [near], ["yaw within 20 deg"], z, dots=False)
 
 
 def relative_rotation(message: RelativeRotation, name: str, scene: ViewerScene) -> Entities:

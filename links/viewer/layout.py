@@ -173,7 +173,7 @@ def _camera_views(vision: Vision) -> Rows:
         contents = ["/sphere/**", "/frames/**"]
         rows.append((24, _space(name, contents, frame=sphere_frame(CameraMount.VEHICLE), eye=eye, grid_m=None)))
     if vision.rotation:
-        rows.append((13, _curves("Yaw branch probabilities [%]", "/plots/branch/**")))
+        rows.append((13, _curves("Probabilities of yaw branches, and of a yaw within 20 deg [%]", "/plots/branch/**")))
     if vision.rotation or vision.pose:
         rows += _rotation_views()
     if vision.odometry:

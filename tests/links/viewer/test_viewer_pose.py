@@ -18,7 +18,15 @@ from links.viewer.layout import Vision, layout
 from links.viewer.scene import Gate
 from links.viewer.stream import Stream
 from stages.geometry.frames import rotation_from_rpy_deg
-from stages.messages import AutopilotEstimator, PoseEstimate, PoseState, PositionEstimate, RelativePose, ServoOffset
+from stages.messages import (
+    AutopilotEstimator,
+    HeadingEstimate,
+    PoseEstimate,
+    PoseState,
+    PositionEstimate,
+    RelativePose,
+    ServoOffset,
+)
 
 NAME = "fuse/relative_pose"
 R = rotation_from_rpy_deg((0.0, 0.0, 90.0))
@@ -218,3 +226,24 @@ def test_axes_that_were_cleared_before_they_were_drawn_have_their_frame():
     path = f"vehicle/{NAME}/axes"
     assert logged[:2] == [(path, False, ["Clear"]), (path, True, ["CoordinateFrame"])]
     assert [static for _, static, _ in logged].count(True) == 1
+
+
+def test_a_heading_is_its_most_probable_yaw_in_the_vehicle_frame_however_many_hypotheses_there_are():
+    heading = HeadingEstimate(
+        stamp_ns=0,
+        yaw_map_rad=np.radians([100.0, 190.0]),
+        sigma_rad=np.radians([4.0, 9.0]),
+        probability=np.array([0.9, 0.1]),
+        vehicle_yaw_rad=math.radians(30.0),
+        near_probability=0.9,
+        decided=False,
+        reason="accelerate sideways",
+    )
+    name, shown = "fuse/heading_estimate", scene()
+    entities = drawn(heading, name, shown)
+    np.testing.assert_allclose(scalars(entities[f"plots/rotation/{name}"]), [70.0])
+    np.testing.assert_allclose(scalars(entities[f"plots/rotation_sigma/{name}"]), [4.0])
+    np.testing.assert_allclose(scalars(entities[f"plots/branch/{name}"]), [90.0])
+    none = np.zeros(0)
+    empty = dataclasses.replace(heading, yaw_map_rad=none, sigma_rad=none, probability=none)
+    assert not any(path.startswith("plots") for path in drawn(empty, name, shown))

@@ -149,7 +149,7 @@ def test_camera_views_exist_only_when_the_graph_has_their_outputs():
     assert len(added) == 8, "seven views, and the tab"
     assert names(Vision(rotation=True)) - without == {
         "Rotation",
-        "Yaw branch probabilities [%]",
+        "Probabilities of yaw branches, and of a yaw within 20 deg [%]",
         "Rotation of the drone in the vehicle frame [deg]",
         "Sigma of the rotation [deg]",
     }

@@ -1,4 +1,4 @@
-"""State of the inertial estimate with its reason.
+"""State of the fused pose with its reason.
 
     LOST            no position, or its sigma or age is beyond the limit
     POSITION_ONLY   the LiDAR measures the drone, its yaw is not known
@@ -18,6 +18,7 @@ import numpy as np
 from stages.fuse.estimator import Estimator
 from stages.fuse.pose_message import MapEstimate
 from stages.fuse.settings import FuseLimits
+from stages.heading.inertial_heading import DECIDED
 from stages.messages import PoseState
 
 RECENT_ROTATION_NS = 1_000_000_000
@@ -57,8 +58,8 @@ def undecided_reason(estimator: Estimator, now_ns: int) -> str:
     e = estimator
     if not e.imu.is_current(now_ns) and e.rotation_ns is None:
         return "no IMU data: request RAW_IMU at 10 Hz or more"
-    if not e.is_own and e.heading.decided:
-        return "the tracked object does not move as the drone's IMU measures"
     if e.decided:
         return "its sigma exceeds yaw_sigma_deg: accelerate sideways"
-    return f"P(yaw within 20 deg) {e.heading.near_probability:.3f}: accelerate sideways"
+    if e.heading.near_probability > DECIDED and not e.is_own:
+        return "not certain that the tracked object moves as the drone's IMU measures: accelerate sideways"
+    return f"P(yaw within 20 deg) {e.heading.near_probability:.3f}, needs {DECIDED} for 0.8 s: accelerate sideways"

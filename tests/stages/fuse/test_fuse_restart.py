@@ -55,7 +55,7 @@ def test_a_hovering_drone_has_its_heading_again_within_seconds(seed: int):
 
 
 def test_a_prior_that_comes_after_the_first_positions_is_used_too():
-    assert hover(from_s=2.0).decided_s < 7.5
+    assert hover(from_s=2.0).decided_s < 10.0
 
 
 def test_a_prior_whose_position_is_elsewhere_does_not_decide():

@@ -153,6 +153,39 @@ def test_a_drone_that_hovers_gives_no_evidence_that_its_poses_are_right():
     assert not agreement.agrees(now_ns)
 
 
+def agreed_after(ends: list[dict[str, Any]]) -> bool:
+    """Whether they agree after 6 s at 1 m/s, and then 20 ms with each of these changes of the pose."""
+    agreement, autopilot = MotionAgreement(SIGMA_M), AutopilotEstimate()
+    for step in range(300 + len(ends)):
+        now_ns, xyz_m = HOST0 + step * 20 * MS, np.array([0.02 * step, 0.0, 10.0])
+        autopilot.position = AutopilotPosition(now_ns, xyz_m, np.zeros(3))
+        autopilot.attitude = AutopilotAttitude(0.0, 0.0, 0.0, now_ns)
+        changes = ends[step - 300] if step >= 300 else {}
+        pose = dataclasses.replace(good_pose(now_ns, xyz_map_m=xyz_m, R_map_drone=np.eye(3)), odom_yaw_rad=None)
+        agreement.add(dataclasses.replace(pose, **changes), autopilot)
+    return agreement.agrees(now_ns)
+
+
+def test_another_track_a_reset_or_a_difference_ends_the_agreement():
+    assert agreed_after([{}])
+    assert not agreed_after([{"track_id": 7}])
+    assert not agreed_after([{"resets": 7}])
+    far = good_pose(HOST0, xyz_map_m=np.array([30.0, 0.0, 10.0]), R_map_drone=np.eye(3)).estimate
+    assert not agreed_after([{"estimate": far}])
+
+
+def test_after_a_pause_of_the_poses_they_have_to_agree_again():
+    flight = Flight()
+    flight.mode = 3  # no switch yet
+    flight.fly(10)
+    assert flight.switch.agreement.agrees(flight.now_ns)
+    flight.poses = False
+    flight.fly(0.6)
+    flight.poses = True
+    flight.fly(0.1)
+    assert not flight.switch.agreement.agrees(flight.now_ns)
+
+
 def test_a_difference_is_reported_and_counted():
     flight = Flight()
     flight.own_speed_mps = 0.0
@@ -256,7 +289,7 @@ def test_it_needs_ardupilot_and_another_set_than_the_first():
             Autopilot(switch_source=True, **wrong)
 
 
-def test_a_link_that_is_reopened_still_knows_the_set_in_use_and_what_the_pilot_selected():
+def test_a_reopened_link_knows_the_set_in_use_and_what_the_pilot_selected_until_the_autopilot_boots():
     link = Autopilot(switch_source=True)
     first = link.open_session(VirtualConnection(), lambda: HOST0, threaded=False)
     text = mavlink.MAVLink_statustext_message(6, b"Using EKF Source Set 3")
@@ -266,6 +299,11 @@ def test_a_link_that_is_reopened_still_knows_the_set_in_use_and_what_the_pilot_s
     second = link.open_session(VirtualConnection(), lambda: HOST0, threaded=False)
     assert second.switch.active == 3
     assert second.switch.status == "source set 2 is not requested: the pilot selected set 3"
+    for boot_ms in (60_000, 1_000):
+        attitude = mavlink.MAVLink_attitude_message(boot_ms, 0, 0, 0, 0, 0, 0)
+        list(second.receive(packed(attitude, mavlink.MAVLink(None, srcSystem=1, srcComponent=1)), PEER, HOST0))
+    assert second.switch.active == 1
+    assert second.switch.status is None
 
 
 def test_over_a_socket_the_request_is_made_and_its_acknowledgement_read(monkeypatch: pytest.MonkeyPatch):

@@ -9,9 +9,12 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega
 
+from links.mavlink import Autopilot
 from links.mavlink.poses.autopilot_estimate import AutopilotAttitude, AutopilotEstimate, EstimateEvent
 from links.mavlink.poses.gate import PoseLimits, RejectReason
 from links.mavlink.poses.pose_sender import PoseSender
+from links.mavlink.transport.framing import packed
+from links.simulated.rig.pose_loop import PEER, VirtualConnection
 from tests.links.mavlink.mavlink_poses import HOST0, MS, good_pose
 
 mavlink: Any = ardupilotmega
@@ -37,6 +40,22 @@ def test_a_turn_that_the_rates_explain_is_no_reset():
 )
 def test_a_change_of_yaw_that_no_rate_explains_is_a_reset(jump_deg: float, event: EstimateEvent | None):
     assert events([attitude(1000, 30.0), attitude(1100, 30.0), attitude(1200, 30.0 + jump_deg)])[-1] is event
+
+
+def test_in_a_fast_turn_the_rates_may_be_wrong_by_their_share():
+    turning = [attitude(1000 + 300 * i, 170 + 1.25 * 36 * i, 120.0) for i in range(20)]  # 25 % faster than the rates
+    assert set(events(turning)) == {None}
+
+
+def test_the_session_stops_positions_without_yaw_when_the_autopilot_resets_its_yaw():
+    link = Autopilot(yaw="none")
+    session = link.open_session(VirtualConnection(), lambda: HOST0, threaded=False)
+    mav = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+    for boot_ms, yaw_deg, sent in ((1000, 30.0, 1), (1100, 30.0, 2), (1200, 60.0, 2)):
+        list(session.receive(packed(attitude(boot_ms, yaw_deg), mav), PEER, HOST0))
+        session.send_pose(good_pose(HOST0 + (boot_ms - 1100) // 10 * MS))
+        assert session.counters.get("sent: ODOMETRY", 0) == sent
+    assert session.poses.rejected == {RejectReason.ODOM_YAW_RESET: 1}
 
 
 def test_over_a_gap_no_reset_is_seen():

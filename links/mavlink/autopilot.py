@@ -126,8 +126,10 @@ class Autopilot(Source[AutopilotSettings]):
         clock = DeviceClock(settings.clock_drift_limit_ppm, round(1e9 * settings.clock_jump_limit_s))
         self._decoder = FrameDecoder((settings.system_id, settings.component_id), settings.own_id, clock)
         self._session: AutopilotSession | None = None
-        self._signer: Signer | None = None  # used by all sessions, as is `_poses`, which knows what the autopilot got
+        # used by all sessions: a link that is reopened continues with the same autopilot
+        self._signer: Signer | None = None
         self._poses: PoseSender | None = None
+        self._switch: SourceSwitch | None = None
         self._sent_state: SentState | None = None
         self._not_connected: int = 0
 
@@ -191,6 +193,15 @@ class Autopilot(Source[AutopilotSettings]):
                 profile=settings.profile,
                 on_rejection=settings.on_rejection,
             )
+        if self._switch is None:
+            self._switch = SourceSwitch(
+                settings.source_set if settings.switch_source else None,
+                settings.required_parameters,
+                target,
+                settings.own_id,
+                self._poses.texts.warn,
+                settings.limits.position_sigma_m,
+            )
         self._session = AutopilotSession(
             connection,
             target,
@@ -198,13 +209,7 @@ class Autopilot(Source[AutopilotSettings]):
             self._poses,
             OriginSender(settings.global_origin, target),
             MessageIntervals(settings.message_rates, settings.profile, target, settings.own_id),
-            SourceSwitch(
-                settings.source_set if settings.switch_source else None,
-                settings.required_parameters,
-                target,
-                settings.own_id,
-                self._poses.texts.warn,
-            ),
+            self._switch,
             self._signer,
             now_ns,
             (settings.topic, SENT_TOPIC),

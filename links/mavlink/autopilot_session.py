@@ -22,23 +22,24 @@ PX4 src/modules/mavlink/mavlink_timesync.cpp.
 from __future__ import annotations
 
 import threading
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import Any
 
 from flow.link import LinkError, Record
+from links.mavlink.frame_sender import FrameSender
 from links.mavlink.origin import OriginSender
+from links.mavlink.poses.autopilot_estimate import EstimateEvent
 from links.mavlink.poses.gate import RejectReason
 from links.mavlink.poses.independence import POSES, Independence
 from links.mavlink.poses.odom_frame import odom_frame
-from links.mavlink.poses.own_estimate import OwnEvent
 from links.mavlink.poses.pose_sender import PoseSender
 from links.mavlink.poses.sent_state import SentState
 from links.mavlink.source_switch import SourceSwitch
 from links.mavlink.streams.message_intervals import MessageIntervals
 from links.mavlink.timesync_monitor import REQUEST_PERIOD_NS, TimesyncMonitor
 from links.mavlink.transport.connection import Connection
-from links.mavlink.transport.framing import FrameSplitter, dialect, header, packed
+from links.mavlink.transport.framing import FrameSplitter, dialect, header
 from links.mavlink.transport.signing import Signer
 from stages.messages import RelativePose
 
@@ -52,9 +53,7 @@ STANDBY, ACTIVE = 3, 4  # MAV_STATE
 REJECTED = (
     "the autopilot's EKF rejects the position: no poses are sent. Is its compass, its GPS or the servo's mount wrong?"
 )
-EARLIER_POSE = "ODOMETRY"  # of an earlier run
 RESTART_REPORTED_NS = 600_000_000_000  # an earlier pose is probably of the same flight, which lasts 10 minutes
-SENT_RECORDS = 4096  # kept until `sent` is called
 
 
 class AutopilotSession:
@@ -83,19 +82,15 @@ class AutopilotSession:
         self.switch = switch
         self._target, self._own = target, own
         self._signer, self._now_ns = signer, now_ns
-        self._received_topic, self._sent_topic = topics
-        self._independence = independence
+        self._received_topic, sent_topic = topics
         self._sent_state = SentState(None, now_ns()) if sent_state is None else sent_state
+        self._sender = FrameSender(connection, own, signer, now_ns, sent_topic, independence, self._sent_state)
         self._splitter = FrameSplitter()
         self._split_connection = 0  # `reconnects` of the splitter's bytes
-        self._mav = dialect().MAVLink(None, srcSystem=own[0], srcComponent=own[1])
-        self._sent: deque[Record] = deque(maxlen=SENT_RECORDS)
+        earlier = self._sender.report_earlier()
         self._earlier_odom: tuple[int, bytes] | None = None  # of an earlier run, until it is a record
-        earlier = self._sent_state.take_earlier()
         if earlier is not None:
-            earlier_ns, pose, odom = earlier
-            independence.on_sent(EARLIER_POSE, earlier_ns)
-            self._sent.append(Record(self._sent_topic, now_ns(), earlier_ns, pose))
+            earlier_ns, odom = earlier
             self._earlier_odom = None if odom is None else (earlier_ns, odom)
             if now_ns() - earlier_ns < RESTART_REPORTED_NS:
                 poses.texts.warn(f"restarted {(now_ns() - earlier_ns) * 1e-9:.0f} s after its last pose")
@@ -103,7 +98,7 @@ class AutopilotSession:
         self._closed = threading.Event()
         self._heartbeat_ns = self._request_ns = 0
         self._timesync = TimesyncMonitor()
-        self._left_late = 0  # late frames of the connection that were handled
+        self._late_frames = 0  # late frames of the connection that were handled
         self._target_ns = now_ns()  # when the autopilot's newest frame arrived, or the session started
         self._target_connection: int | None = None  # `reconnects` at its newest frame; NO_CONNECTION: not authenticated
         if signer is not None:
@@ -149,22 +144,20 @@ class AutopilotSession:
             if sent:
                 self.poses.on_sent(pose, now_ns, sent)
                 if any(message.get_type() in POSES for message in sent):
-                    self.switch.on_sent(pose, self.poses.own, now_ns)
+                    self.switch.on_sent(pose, self.poses.autopilot, now_ns)
             self._send_texts(now_ns)
 
     def sent(self) -> list[Record]:
         """Records of the frames sent since the previous call."""
         with self._lock:
-            records = list(self._sent)
-            self._sent.clear()
-        return records
+            return self._sender.records()
 
     @property
     def counters(self) -> dict[str, int]:
         """Totals since the start: received, sent, not sent, rejected poses by reason."""
         with self._lock:
             rejected = {f"pose rejected: {reason.value}": count for reason, count in self.poses.rejected.items()}
-            counts = dict(self.counts)
+            counts = self.counts | self._sender.counts
             if self.poses.fusion.rejections:
                 counts["pose rejected by the autopilot"] = self.poses.fusion.rejections
             if self.origin.sent_times:
@@ -183,7 +176,7 @@ class AutopilotSession:
             "from other senders": self.connection.foreign,
             "reconnects": self.connection.reconnects,
             "closed: blocked": self.connection.stalls,
-            "sent late": self.connection.left_late,
+            "sent late": self.connection.late_frames,
             **({"round trip [ms]": round_trip_ns // 1_000_000} if round_trip_ns is not None else {}),
             **({"signing time not written": self._signer.unwritten} if self._signer is not None else {}),
         }
@@ -255,7 +248,7 @@ class AutopilotSession:
                 self._target_ns, self._target_connection = self._now_ns(), self.connection.reconnects
                 self.origin.on_message(message)
                 self.poses.on_estimator_status(message, arrival_ns)
-                self._on_own_estimate(self.poses.own.add(message, arrival_ns))
+                self._on_estimate(self.poses.autopilot.add(message, arrival_ns))
                 self.intervals.on_message(message, arrival_ns)
                 self.switch.on_message(message, arrival_ns)
                 if message.get_type() == "TIMESYNC":
@@ -265,14 +258,14 @@ class AutopilotSession:
                         return message.ts1
         return arrival_ns
 
-    def _on_own_estimate(self, event: OwnEvent | None) -> None:
+    def _on_estimate(self, event: EstimateEvent | None) -> None:
         """What the autopilot's own estimate shows. The lock is held."""
-        if event is OwnEvent.BOOTED:
+        if event is EstimateEvent.BOOTED:
             self.poses.on_boot()
             self.origin.restart()
             self.intervals.restart()
             self.switch.on_boot()
-        elif event is OwnEvent.YAW_RESET:
+        elif event is EstimateEvent.YAW_RESET:
             self.poses.on_yaw_reset()
 
     def _accept_for_heartbeats(self, source: tuple[str, int]) -> None:
@@ -314,8 +307,8 @@ class AutopilotSession:
                 self._request_ns = now_ns
                 if self._timesync.on_request(request_ns):
                     self.poses.texts.warn("no TIMESYNC replies: latency unknown")
-        if self.connection.left_late != self._left_late:
-            self._left_late = self.connection.left_late
+        if self.connection.late_frames != self._late_frames:
+            self._late_frames = self.connection.late_frames
             self._timesync.on_late_frame(now_ns)
 
     def tick(self) -> None:
@@ -343,18 +336,7 @@ class AutopilotSession:
                 self.poses.texts.on_not_sent()
 
     def _send(self, message: Any, pose: RelativePose | None = None) -> bool:
-        """Pack, sign and send one message, of a pose if it is one. The lock is held."""
-        now_ns = self._now_ns()
-        if self._signer is not None:
-            self._signer.sign_for(self._mav, now_ns)
-        frame = packed(message, self._mav)
-        kind = message.get_type()
-        if not self.connection.send(frame):
-            self.counts[f"not sent: {kind}"] += 1
-            return False
-        self.counts[f"sent: {kind}"] += 1
-        self._independence.on_sent(kind, now_ns)
-        if kind in POSES and pose is not None:
-            self._sent_state.on_sent(frame, now_ns, lambda: odom_frame(pose, self.poses.own, self._own))
-        self._sent.append(Record(self._sent_topic, now_ns, now_ns, frame))
-        return True
+        """Send one message, of a pose if it is one. The lock is held."""
+        return self._sender.send(
+            message, None if pose is None else lambda: odom_frame(pose, self.poses.autopilot, self._own)
+        )

@@ -14,7 +14,8 @@ acknowledges our command without a text, and reports nowhere which set is in use
 
 Set 1 is requested FALLBACK_AFTER_NS after the last pose, once a second until it is acknowledged, if its position is
 from another source than grd. ArduPilot alone does not return to it. Without a connection, or after the end of grd,
-nothing is requested: the pilot has to switch.
+nothing is requested: the pilot has to switch. Neither does grd that was restarted in flight request set 1 before it has
+requested its own set again, because it does not know which set is in use.
 
 Source: ours; ArduPilot GCS_MAVLINK::handle_command_set_ekf_source_set, RC_Channel::do_aux_function (EKF_SOURCE_SET),
 ArduCopter mode.h (numbers of modes), NavEKF3_core::send_status_report.
@@ -28,8 +29,8 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from links.mavlink.commands import ACCEPTED, ACK_TIMEOUT_NS, IN_PROGRESS, TEMPORARILY_REJECTED, command_long, is_answer
-from links.mavlink.poses.agreement import Agreement
-from links.mavlink.poses.own_estimate import OwnEstimate
+from links.mavlink.poses.agreement import MotionAgreement
+from links.mavlink.poses.autopilot_estimate import AutopilotEstimate
 from links.mavlink.profiles import EXTERNAL, RequiredParameter, findings
 from links.mavlink.readers import CONSTANT_POSITION, HORIZONTAL_RELATIVE
 from links.mavlink.transport.framing import dialect
@@ -39,21 +40,18 @@ SET_EKF_SOURCE_SET = 42007  # MAV_CMD
 FIRST_SET = 1  # flies without grd
 MODES = {0, 2, 4, 5, 16, 17}  # ArduCopter: Stabilize, AltHold, Guided, Loiter, PosHold, Brake
 ARMED = 128  # MAV_MODE_FLAG_SAFETY_ARMED
-MIN_SENDING_NS = 5_000_000_000  # as ArduPilot's EKF takes to converge to a new source
+MIN_SENDING_NS = 5_000_000_000  # ours: poses that are often interrupted cause no switch
 FALLBACK_AFTER_NS = 500_000_000  # without a pose; ArduPilot times out after 0.3 s, its EKF failsafe acts after 1 s
 MAX_FIX_AGE_NS = 1_000_000_000  # age of the LiDAR position in a pose
 MAX_STATUS_AGE_NS = 2_000_000_000  # age of the EKF's status
 MAX_RATIO = 0.5  # test ratio; above 1 the EKF rejects
 TRIES = 3
-PARAMETER_PERIOD_NS, PARAMETER_RETRY_PERIOD_NS = (
-    200_000_000,
-    10_000_000_000,
-)  # between requests: first, and after three of each
+PARAMETER_PERIOD_NS, PARAMETER_RETRY_PERIOD_NS = 200_000_000, 10_000_000_000  # of requests, and after TRIES of each
 USING = re.compile(r"Using EKF Source Set (\d)")
 
 
 class SourceSwitch:
-    """Requests source sets of one ArduPilot. `source_set` None: none is requested."""
+    """Requests source sets of one ArduPilot, in one run of grd. `source_set` None: none is requested."""
 
     def __init__(
         self,
@@ -62,10 +60,11 @@ class SourceSwitch:
         target: tuple[int, int],
         own: tuple[int, int],
         warn: Callable[[str], None],
+        pose_sigma_m: float,
     ) -> None:
         self.requests = 0
         """How often a set was requested."""
-        self.agreement = Agreement()
+        self.agreement = MotionAgreement(pose_sigma_m)
         self._set, self._required = source_set, required
         self._target, self._own, self._warn = target, own, warn
         self.on_boot()
@@ -116,15 +115,15 @@ class SourceSwitch:
         elif is_answer(message, SET_EKF_SOURCE_SET, self._own):
             self._on_result(message.result)
 
-    def on_sent(self, pose: RelativePose, own: OwnEstimate, now_ns: int) -> None:
-        """A pose was sent; `own`: the autopilot's estimate."""
+    def on_sent(self, pose: RelativePose, autopilot: AutopilotEstimate, now_ns: int) -> None:
+        """A pose was sent; `autopilot`: its newest estimate."""
         if self._set is None:
             return
         if self._sending_ns is None or now_ns - self._sent_ns > FALLBACK_AFTER_NS:
             self._sending_ns = now_ns
             self.agreement.restart()
         self._sent, self._sent_ns = pose, now_ns
-        off_m = self.agreement.add(pose, own)
+        off_m = self.agreement.add(pose, autopilot)
         if off_m is not None and self.active != self._set:
             self._warn(f"pose and autopilot differ by {off_m:.1f} m")
 

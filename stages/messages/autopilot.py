@@ -105,7 +105,7 @@ class EarlierOdomFrame(Message):
 class HeadingPrior(Message):
     """Yaw and position of the drone after a restart of grd in flight, by the autopilot's own propagation since.
 
-    Right if frame odom has not changed since the earlier run; a LiDAR position near this one speaks for it.
+    Valid if frame odom has not changed since the earlier run: then the LiDAR position is near this one.
     """
 
     yaw_map_rad: float  # of the body

@@ -22,7 +22,7 @@ from links.mavlink.ned_frd import (
     upper_from_pose_covariance,
     wxyz_from_R_odom_drone,
 )
-from links.mavlink.poses.own_estimate import OwnEstimate
+from links.mavlink.poses.autopilot_estimate import AutopilotEstimate
 from links.mavlink.poses.pose_messages import BODY_FRD, LOCAL_FRD, UNKNOWN_COVARIANCE, VIO
 from links.mavlink.readers import read_odometry
 from links.mavlink.transport.framing import dialect
@@ -31,9 +31,9 @@ from stages.heading.inertial_state import yaw_sigma_rad
 from stages.messages import EarlierOdomFrame, PoseEstimate, RelativePose
 
 
-def odom_yaw_rad(pose: RelativePose, own: OwnEstimate) -> float | None:
+def odom_yaw_rad(pose: RelativePose, autopilot: AutopilotEstimate) -> float | None:
     """Yaw of the autopilot's axes in `map`; None: not known."""
-    attitude = own.attitude
+    attitude = autopilot.attitude
     if pose.odom_yaw_rad is not None:
         return pose.odom_yaw_rad
     if attitude is None or not isinstance(pose.estimate, PoseEstimate):
@@ -42,12 +42,12 @@ def odom_yaw_rad(pose: RelativePose, own: OwnEstimate) -> float | None:
     return heading_rad(pose.estimate.R_map_drone) - heading_rad(R_odom_drone)
 
 
-def odom_frame(pose: RelativePose, own: OwnEstimate, sender: tuple[int, int]) -> bytes | None:
+def odom_frame(pose: RelativePose, autopilot: AutopilotEstimate, sender: tuple[int, int]) -> bytes | None:
     """Frame of `odom` in `map` at a pose that was sent; None: not known."""
-    yaw_rad, sigma_rad = odom_yaw_rad(pose, own), pose.odom_yaw_sigma_rad
+    yaw_rad, sigma_rad = odom_yaw_rad(pose, autopilot), pose.odom_yaw_sigma_rad
     if pose.odom_yaw_rad is None and isinstance(pose.estimate, PoseEstimate):
         sigma_rad = yaw_sigma_rad(pose.estimate.R_map_drone, pose.estimate.map_covariance)
-    xyz_odom_m = None if own.position is None else own.position.at(pose.stamp_ns)
+    xyz_odom_m = None if autopilot.position is None else autopilot.position.at(pose.stamp_ns)
     if yaw_rad is None or sigma_rad is None or xyz_odom_m is None or pose.xyz_map_m is None:
         return None
     R_map_odom = rotation_z(yaw_rad)

@@ -22,9 +22,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from links.mavlink.poses.autopilot_estimate import AutopilotEstimate
 from links.mavlink.poses.fusion_monitor import FusionMonitor, OnRejection
 from links.mavlink.poses.gate import PoseLimits, RejectReason, reject_reason
-from links.mavlink.poses.own_estimate import OwnEstimate
 from links.mavlink.poses.pose_messages import landing_target, odometry, vision_position_estimate
 from links.mavlink.poses.position_gate import gate_reason
 from links.mavlink.poses.position_messages import position_odometry, position_vision_estimate
@@ -82,7 +82,7 @@ class PoseSender:
         sufficient = (PoseState.FULL, PoseState.POSITION_ONLY) if yaw == "none" else (PoseState.FULL,)
         self.texts = StatusTexts(sufficient)
         self.fusion = FusionMonitor(on_rejection)
-        self.own = OwnEstimate()
+        self.autopilot = AutopilotEstimate()
 
     @property
     def sending(self) -> bool:
@@ -173,8 +173,8 @@ class PoseSender:
 
     def _axes_reason(self, pose: RelativePose, now_ns: int) -> RejectReason | None:
         """Why the autopilot's axes are not those that were learnt. The first ATTITUDE after a silence shows a boot."""
-        own = self.own.attitude
-        if own is None or now_ns - own.arrival_ns > MAX_ATTITUDE_AGE_NS:
+        attitude = self.autopilot.attitude
+        if attitude is None or now_ns - attitude.arrival_ns > MAX_ATTITUDE_AGE_NS:
             return RejectReason.NO_ATTITUDE
         if self._yaw_reset:
             return RejectReason.ODOM_YAW_RESET
@@ -200,8 +200,8 @@ class PoseSender:
         return landing_target(pose)
 
     def _position_message(self, kind: PoseMessage, pose: RelativePose) -> Any:
-        own = self.own.attitude if self._profile == "ardupilot" else None
+        attitude = self.autopilot.attitude if self._profile == "ardupilot" else None
         if kind == "odometry":
-            return position_odometry(pose, self.reset_counter, self._limits, own, self._moved_m(pose))
-        assert own is not None  # PX4 has no VISION_POSITION_ESTIMATE
-        return position_vision_estimate(pose, self.reset_counter, own, self._moved_m(pose))
+            return position_odometry(pose, self.reset_counter, self._limits, attitude, self._moved_m(pose))
+        assert attitude is not None  # PX4 has no VISION_POSITION_ESTIMATE
+        return position_vision_estimate(pose, self.reset_counter, attitude, self._moved_m(pose))

@@ -69,7 +69,7 @@ class StreamConnection:
     datagrams = False
 
     def __init__(self, line: Line) -> None:
-        self.reconnects = self.foreign = self.stalls = self.left_late = 0
+        self.reconnects = self.foreign = self.stalls = self.late_frames = 0
         self._line = line
         self._status, self._status_s = "", -MIN_STATUS_S  # the newest error, and its time
         self._up = True
@@ -162,7 +162,7 @@ class StreamConnection:
         sent_bytes = self._queued_bytes - len(self._rest) - buffered_bytes
         while self._in_flight and self._in_flight[0][0] <= sent_bytes:
             _, start_s = self._in_flight.popleft()
-            self.left_late += time.monotonic() - start_s > 1e-9 * MAX_LATENCY_NS
+            self.late_frames += time.monotonic() - start_s > 1e-9 * MAX_LATENCY_NS
         return buffered_bytes
 
     def _on_lost(self, how: str = "is lost: is it plugged in and powered?") -> None:

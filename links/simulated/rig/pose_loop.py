@@ -30,7 +30,7 @@ class VirtualConnection:
     status: str | None = None
 
     def __init__(self) -> None:
-        self.reconnects = self.foreign = self.stalls = self.left_late = 0
+        self.reconnects = self.foreign = self.stalls = self.late_frames = 0
         self._open = False
 
     def receive(self, timeout_s: float) -> tuple[bytes, tuple[str, int]] | None:

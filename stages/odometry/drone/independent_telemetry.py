@@ -2,7 +2,7 @@
 
     DroneLocalPosition, DroneOdometry, DroneAttitude   passed on while `independent`, else dropped
     DroneTilt                                          always: roll and pitch of DroneAttitude, never its yaw
-    HeadingPrior                                       after a restart of grd in flight, for PRIOR_S
+    HeadingPrior                                       for PRIOR_S after the newest pose of an earlier run of grd
 
 Position, velocity and yaw of an autopilot that fuses poses of grd are those poses: used as odometry, they confirm any
 error of grd, and the loop diverges. Roll and pitch come from its accelerometer; their sigma is larger then, because an
@@ -14,7 +14,7 @@ the compass or the poses of that run. The prior is a memory of grd's own pose, n
 odom has changed meanwhile, by another source set or a reset; a reboot ends it, because the estimate is independent
 then. Its position drifts as an IMU does (DRIFT_MPS2).
 
-Source: ours; issue "A real autopilot flies on it", error after a LiDAR gap of 5 s by IMU alone: 1.4 m.
+Source: ours; DRIFT_MPS2 by a LiDAR gap of 5 s in simulation, bridged by the IMU alone: 1.4 m of error.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from stages.odometry.drone.trajectory import DRIFT_RAD2_PER_S
 RATE_NS = 100_000_000  # largest age of an IMU sample against the attitude
 PRIOR_S = 30.0  # since the newest pose of the earlier run
 POSITION_NS = 200_000_000  # largest age of the autopilot's position against the attitude; it is extrapolated
-START_M, DRIFT_MPS2 = 0.5, 0.11  # error of the autopilot's position when the earlier run ended; 1.4 m after 5 s
+START_M, DRIFT_MPS2 = 0.5, 0.11  # error of the autopilot's position when the earlier run ended (assumed); its growth
 
 
 class IndependentTelemetrySettings(Settings):

@@ -14,12 +14,14 @@ from pydantic import ValidationError
 from pymavlink.dialects.v20 import ardupilotmega
 
 from links.mavlink import Autopilot, source_switch
-from links.mavlink.poses.agreement import LEAST_M, Agreement
-from links.mavlink.poses.own_estimate import OwnAttitude, OwnEstimate, OwnPosition
+from links.mavlink.poses.agreement import MotionAgreement
+from links.mavlink.poses.autopilot_estimate import AutopilotAttitude, AutopilotEstimate, AutopilotPosition
+from links.mavlink.poses.gate import PoseLimits
 from links.mavlink.profiles import required_parameters
 from links.mavlink.source_switch import SET_EKF_SOURCE_SET, SourceSwitch
 from links.mavlink.transport.framing import packed, parse_frame
 from links.simulated.rig.closed_loop import load_loop
+from links.simulated.rig.pose_loop import PEER, VirtualConnection
 from links.simulated.rig.run import Simulation
 from links.simulated.rig.scenario import load_scenario
 from stages.geometry.frames import rotation_z
@@ -30,6 +32,7 @@ mavlink: Any = ardupilotmega
 ROOT = Path(__file__).parents[3]
 REQUIRED = required_parameters("ardupilot", "measured", 2)
 ACCEPTED, DENIED = 0, 2
+SIGMA_M = PoseLimits().position_sigma_m
 POSITION, NO_POSITION = 0b1111, 0b10000111  # flags of EKF_STATUS_REPORT
 
 
@@ -38,7 +41,7 @@ class Flight:
 
     def __init__(self, **parameters: float) -> None:
         self.texts: list[str] = []
-        self.switch = SourceSwitch(2, REQUIRED, (1, 1), (1, 197), self.texts.append)
+        self.switch = SourceSwitch(2, REQUIRED, (1, 1), (1, 197), self.texts.append, SIGMA_M)
         self.values = {p.name: p.best for p in REQUIRED} | parameters
         self.now_ns, self.step = HOST0, 0
         self.results: list[int | None] = []  # of the next requests; then ACCEPTED; None: no answer
@@ -48,7 +51,7 @@ class Flight:
         self.yaw_error_rad, self.compass_rad = 0.0, 0.0
         self.measured = True
         self.own_speed_mps = 1.0
-        self.own = OwnEstimate()
+        self.autopilot = AutopilotEstimate()
 
     def fly(self, seconds: float) -> Flight:
         for _ in range(round(50 * seconds)):
@@ -71,7 +74,7 @@ class Flight:
         if self.flags == POSITION:
             v = self.own_speed_mps
             message = mavlink.MAVLink_local_position_ned_message(self.step * 20, 50 + v * x_m, 7, -30, v, 0, 0)
-            self.own.add(message, self.now_ns)
+            self.autopilot.add(message, self.now_ns)
             give(message)
         if self.poses:
             pose = good_pose(
@@ -79,8 +82,8 @@ class Flight:
             )
             measured_ns = self.now_ns if self.measured else self.now_ns - 2_000 * MS
             pose = dataclasses.replace(pose, odom_yaw_rad=None, measured_ns=measured_ns)
-            self.own.attitude = OwnAttitude(0.0, 0.0, self.compass_rad, self.now_ns)
-            self.switch.on_sent(pose, self.own, self.now_ns)
+            self.autopilot.attitude = AutopilotAttitude(0.0, 0.0, self.compass_rad, self.now_ns)
+            self.switch.on_sent(pose, self.autopilot, self.now_ns)
 
     def _answer(self, request: Any) -> None:
         if request.get_type() == "PARAM_REQUEST_READ":
@@ -104,7 +107,8 @@ class Flight:
 
 
 def test_the_set_is_requested_once_when_poses_are_sent_and_move_as_the_autopilot_does():
-    flight = Flight().fly(LEAST_M - 0.5)
+    flight = Flight()
+    flight.fly(flight.switch.agreement.least_m - 0.5)  # at 1 m/s
     assert flight.requested == []
     flight.fly(20)
     assert flight.requested == [2]
@@ -114,7 +118,7 @@ def test_the_set_is_requested_once_when_poses_are_sent_and_move_as_the_autopilot
 
 def test_nothing_is_requested_unless_configured():
     flight = Flight()
-    flight.switch = SourceSwitch(None, REQUIRED, (1, 1), (1, 197), flight.texts.append)
+    flight.switch = SourceSwitch(None, REQUIRED, (1, 1), (1, 197), flight.texts.append, SIGMA_M)
     assert flight.fly(20).requested == []
 
 
@@ -141,12 +145,45 @@ def test_the_set_is_not_requested_while_a_condition_does_not_hold(changes: dict[
 
 
 def test_a_drone_that_hovers_gives_no_evidence_that_its_poses_are_right():
-    agreement, own, now_ns = Agreement(), OwnEstimate(), HOST0
+    agreement, autopilot, now_ns = MotionAgreement(SIGMA_M), AutopilotEstimate(), HOST0
     for _ in range(1500):
         now_ns += 20 * MS
-        own.position = OwnPosition(now_ns, np.array([1.0, 2.0, 3.0]), np.zeros(3))
-        assert agreement.add(good_pose(now_ns), own) is None
+        autopilot.position = AutopilotPosition(now_ns, np.array([1.0, 2.0, 3.0]), np.zeros(3))
+        assert agreement.add(good_pose(now_ns), autopilot) is None
     assert not agreement.agrees(now_ns)
+
+
+def agreed_after(ends: list[dict[str, Any]]) -> bool:
+    """Whether they agree after 6 s at 1 m/s, and then 20 ms with each of these changes of the pose."""
+    agreement, autopilot = MotionAgreement(SIGMA_M), AutopilotEstimate()
+    for step in range(300 + len(ends)):
+        now_ns, xyz_m = HOST0 + step * 20 * MS, np.array([0.02 * step, 0.0, 10.0])
+        autopilot.position = AutopilotPosition(now_ns, xyz_m, np.zeros(3))
+        autopilot.attitude = AutopilotAttitude(0.0, 0.0, 0.0, now_ns)
+        changes = ends[step - 300] if step >= 300 else {}
+        pose = dataclasses.replace(good_pose(now_ns, xyz_map_m=xyz_m, R_map_drone=np.eye(3)), odom_yaw_rad=None)
+        agreement.add(dataclasses.replace(pose, **changes), autopilot)
+    return agreement.agrees(now_ns)
+
+
+def test_another_track_a_reset_or_a_difference_ends_the_agreement():
+    assert agreed_after([{}])
+    assert not agreed_after([{"track_id": 7}])
+    assert not agreed_after([{"resets": 7}])
+    far = good_pose(HOST0, xyz_map_m=np.array([30.0, 0.0, 10.0]), R_map_drone=np.eye(3)).estimate
+    assert not agreed_after([{"estimate": far}])
+
+
+def test_after_a_pause_of_the_poses_they_have_to_agree_again():
+    flight = Flight()
+    flight.mode = 3  # no switch yet
+    flight.fly(10)
+    assert flight.switch.agreement.agrees(flight.now_ns)
+    flight.poses = False
+    flight.fly(0.6)
+    flight.poses = True
+    flight.fly(0.1)
+    assert not flight.switch.agreement.agrees(flight.now_ns)
 
 
 def test_a_difference_is_reported_and_counted():
@@ -250,6 +287,23 @@ def test_it_needs_ardupilot_and_another_set_than_the_first():
     for wrong in ({"profile": "px4"}, {"source_set": 1}):
         with pytest.raises(ValidationError, match="switch_source: needs profile ardupilot and source_set 2 or 3"):
             Autopilot(switch_source=True, **wrong)
+
+
+def test_a_reopened_link_knows_the_set_in_use_and_what_the_pilot_selected_until_the_autopilot_boots():
+    link = Autopilot(switch_source=True)
+    first = link.open_session(VirtualConnection(), lambda: HOST0, threaded=False)
+    text = mavlink.MAVLink_statustext_message(6, b"Using EKF Source Set 3")
+    frame = packed(text, mavlink.MAVLink(None, srcSystem=1, srcComponent=1))
+    assert len(list(first.receive(frame, PEER, HOST0))) == 1
+    first.close()
+    second = link.open_session(VirtualConnection(), lambda: HOST0, threaded=False)
+    assert second.switch.active == 3
+    assert second.switch.status == "source set 2 is not requested: the pilot selected set 3"
+    for boot_ms in (60_000, 1_000):
+        attitude = mavlink.MAVLink_attitude_message(boot_ms, 0, 0, 0, 0, 0, 0)
+        list(second.receive(packed(attitude, mavlink.MAVLink(None, srcSystem=1, srcComponent=1)), PEER, HOST0))
+    assert second.switch.active == 1
+    assert second.switch.status is None
 
 
 def test_over_a_socket_the_request_is_made_and_its_acknowledgement_read(monkeypatch: pytest.MonkeyPatch):

@@ -109,7 +109,7 @@ class RatedBridge:
     """A bridge behind a fast line: accepts every datagram."""
 
     datagrams, status = True, None
-    reconnects = foreign = stalls = left_late = 0
+    reconnects = foreign = stalls = late_frames = 0
 
     def __init__(self, line: RatedLine) -> None:
         self.line = line
@@ -152,7 +152,7 @@ class SlowFlight:
             pose_sender,
             OriginSender(None, (1, 1)),
             MessageIntervals(NO_REQUESTS, "ardupilot", (1, 1), (1, 197)),
-            SourceSwitch(None, (), (1, 1), (1, 197), pose_sender.texts.warn),
+            SourceSwitch(None, (), (1, 1), (1, 197), pose_sender.texts.warn, 0.35),
             None,
             lambda: self.now_ns,
             ("/autopilot/rx", "/autopilot/tx"),

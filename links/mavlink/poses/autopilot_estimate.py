@@ -32,7 +32,7 @@ MAX_POSITION_AGE_NS = 300_000_000  # of its position against a pose; it is extra
 
 
 @dataclass(frozen=True, slots=True)
-class OwnAttitude:
+class AutopilotAttitude:
     """The autopilot's attitude as it reported it: NED, FRD."""
 
     roll_rad: float
@@ -42,7 +42,7 @@ class OwnAttitude:
 
 
 @dataclass(frozen=True, slots=True)
-class OwnPosition:
+class AutopilotPosition:
     """The autopilot's own position as it reported it, in grd's axes."""
 
     arrival_ns: int
@@ -57,24 +57,24 @@ class OwnPosition:
         )
 
 
-class OwnEvent(enum.Enum):
+class EstimateEvent(enum.Enum):
     """What a message shows in addition to the estimate."""
 
     BOOTED = enum.auto()
     YAW_RESET = enum.auto()
 
 
-class OwnEstimate:
+class AutopilotEstimate:
     """Evaluates the autopilot's messages in order."""
 
     def __init__(self) -> None:
-        self.attitude: OwnAttitude | None = None
-        self.position: OwnPosition | None = None
+        self.attitude: AutopilotAttitude | None = None
+        self.position: AutopilotPosition | None = None
         self._newest_ms: int | None = None  # time since boot, of any message
         self._attitude_ms = 0  # the same of the attitude
         self._yaw_rate = 0.0
 
-    def add(self, message: Any, arrival_ns: int) -> OwnEvent | None:
+    def add(self, message: Any, arrival_ns: int) -> EstimateEvent | None:
         """Add a message; a late one, and values that are not finite, are ignored."""
         boot_ms = getattr(message, "time_boot_ms", None)
         if boot_ms is None:
@@ -89,10 +89,10 @@ class OwnEstimate:
         elif kind == "LOCAL_POSITION_NED":
             values = np.array([message.x, message.y, message.z, message.vx, message.vy, message.vz])
             if np.isfinite(values).all():
-                self.position = OwnPosition(arrival_ns, flip_yz(values[:3]), flip_yz(values[3:]))
+                self.position = AutopilotPosition(arrival_ns, flip_yz(values[:3]), flip_yz(values[3:]))
         if booted:
-            return OwnEvent.BOOTED
-        return OwnEvent.YAW_RESET if yaw_reset else None
+            return EstimateEvent.BOOTED
+        return EstimateEvent.YAW_RESET if yaw_reset else None
 
     def _add_attitude(self, message: Any, arrival_ns: int) -> bool:
         """Whether the yaw was reset since the attitude before."""
@@ -104,7 +104,7 @@ class OwnEstimate:
             return False
         rate = _yaw_rate(*values[:2], *values[3:])
         turn = 0.5e-3 * elapsed_ms * (rate + self._yaw_rate)
-        self.attitude = OwnAttitude(message.roll, message.pitch, message.yaw, arrival_ns)
+        self.attitude = AutopilotAttitude(message.roll, message.pitch, message.yaw, arrival_ns)
         self._attitude_ms, self._yaw_rate = message.time_boot_ms, rate
         if last is None or elapsed_ms > MAX_ATTITUDE_GAP_MS:
             return False

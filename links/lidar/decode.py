@@ -17,9 +17,9 @@ from __future__ import annotations
 import numpy as np
 
 from links.lidar.formats import AnyFormat, packet_format
-from links.lidar.packet_format import DUAL, STRONGEST
+from links.lidar.packet_format import STRONGEST
 from links.lidar.velodyne import RETURN_MODE_AT
-from stages.kernels.lidar.packets import decode, decode_dual
+from stages.kernels.lidar.packets import Rows, decode
 from stages.messages import LidarFirings
 
 
@@ -33,15 +33,17 @@ class FiringRows:
         self._start()
 
     def _start(self) -> None:
-        rows = self._max_packets * self._form.max_rows
-        self.packets = self._rows = self._stamp_ns = self._lost_packets = 0
-        self._pulse_stamp_ns = np.empty(rows, np.int64)
-        self._laser = np.empty(rows, np.uint8)
-        self._azimuth_rad = np.empty(rows, np.float32)
-        self._range_m = np.empty(rows, np.float32)
-        self._reflectivity = np.empty(rows, np.uint8)
-        self._return_kind = np.empty(rows, np.uint8)
-        self._xyz_lidar_m = np.empty((rows, 3), np.float32)
+        size = self._max_packets * self._form.max_rows
+        self.packets = self._count = self._stamp_ns = self._lost_packets = 0
+        self._rows = Rows(
+            pulse_stamp_ns=np.empty(size, np.int64),
+            laser=np.empty(size, np.uint8),
+            azimuth_rad=np.empty(size, np.float32),
+            range_m=np.empty(size, np.float32),
+            reflectivity=np.empty(size, np.uint8),
+            return_kind=np.empty(size, np.uint8),
+            xyz_lidar_m=np.empty((size, 3), np.float32),
+        )
 
     @property
     def full(self) -> bool:
@@ -57,42 +59,28 @@ class FiringRows:
         sends when the last return is the strongest). Returns False and adds nothing when the azimuths are invalid.
         """
         form = self._form
-        free = slice(self._rows, self._rows + form.max_rows)
-        kernel = decode_dual if form.return_mode(data) == "dual" else decode
-        rows = kernel(
-            data,
-            stamp_ns,
-            form.layout,
-            form.scales,
-            form.pulses,
-            self._pulse_stamp_ns[free],
-            self._laser[free],
-            self._azimuth_rad[free],
-            self._range_m[free],
-            self._reflectivity[free],
-            self._return_kind[free],
-            self._xyz_lidar_m[free],
-        )
+        dual = form.return_mode(data) == "dual"
+        rows = decode(data, stamp_ns, dual, form.layout, form.scales, form.pulses, self._count, *self._rows)
         if rows == 0:
             return False
         if self.packets == 0:
             self._stamp_ns, self._lost_packets = stamp_ns, lost_packets
         self.packets += 1
-        self._rows += rows
+        self._count += rows
         return True
 
     def take(self) -> LidarFirings:
         """The message of all packets added since the previous call."""
-        filled = slice(0, self._rows)
+        rows, count = self._rows, self._count
         firings = LidarFirings(
             stamp_ns=self._stamp_ns,
-            pulse_stamp_ns=self._pulse_stamp_ns[filled],
-            laser=self._laser[filled],
-            azimuth_rad=self._azimuth_rad[filled],
-            range_m=self._range_m[filled],
-            reflectivity=self._reflectivity[filled],
-            return_kind=self._return_kind[filled],
-            xyz_lidar_m=self._xyz_lidar_m[filled],
+            pulse_stamp_ns=rows.pulse_stamp_ns[:count],
+            laser=rows.laser[:count],
+            azimuth_rad=rows.azimuth_rad[:count],
+            range_m=rows.range_m[:count],
+            reflectivity=rows.reflectivity[:count],
+            return_kind=rows.return_kind[:count],
+            xyz_lidar_m=rows.xyz_lidar_m[:count],
             lost_packets=self._lost_packets,
             laser_elevation_rad=self._form.elevation_rad,
         )
@@ -101,7 +89,5 @@ class FiringRows:
 
 
 def compile_kernels() -> None:
-    """Compile the kernels, or load them from numba's cache, before the first packet arrives."""
-    form = packet_format("VLP-16")
-    for mode in (STRONGEST, DUAL):
-        FiringRows(form, 1).add(bytes(RETURN_MODE_AT) + bytes([mode, 0]), 0, 0)
+    """Compile the kernel, or load it from numba's cache, before the first packet arrives."""
+    FiringRows(packet_format("VLP-16"), 1).add(bytes(RETURN_MODE_AT) + bytes([STRONGEST, 0]), 0, 0)

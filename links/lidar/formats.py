@@ -9,7 +9,6 @@ import functools
 
 from links.lidar.hesai import HesaiFormat
 from links.lidar.ouster import OusterFormat
-from links.lidar.packet_format import PacketFormat
 from links.lidar.reject_reason import PacketRejectReason
 from links.lidar.velodyne import VelodyneFormat
 from stages.geometry.lidar_models import LIDAR_MODELS, lidar_profile
@@ -31,7 +30,7 @@ def packet_format(model: str, beams: LidarBeams | None = None) -> AnyFormat:
 
 
 def recognised_model(data: bytes) -> str | None:
-    """The model that sent a data packet, where the packet tells it; None for an Ouster's and for anything else."""
+    """The model that sent a data packet, where the packet names it; None for an Ouster's and for anything else."""
     for form in _same_for_all_units():
         reason = form.reject_reason(data)
         if reason is None or (isinstance(form, VelodyneFormat) and reason not in NOT_THE_MODEL):
@@ -42,6 +41,3 @@ def recognised_model(data: bytes) -> str | None:
 @functools.cache
 def _same_for_all_units() -> tuple[AnyFormat, ...]:
     return tuple(packet_format(model) for model in LIDAR_MODELS if not model.startswith("OS"))
-
-
-__all__ = ["AnyFormat", "PacketFormat", "packet_format", "recognised_model"]

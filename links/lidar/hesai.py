@@ -9,7 +9,7 @@ Source: Hesai PandarXT and PandarXT-16 user manuals, section 3.1 (packet) and ap
 
 from __future__ import annotations
 
-from links.lidar.packet_format import DUAL, MODE_NAMES, MODES, PacketFormat, block_layout
+from links.lidar.packet_format import MODE_NAMES, MODES, PacketFormat, block_layout
 from links.lidar.reject_reason import PacketRejectReason
 from stages.geometry.lidar_models import LidarProfile
 from stages.geometry.rig_lidar import LidarBeams
@@ -80,6 +80,3 @@ class HesaiFormat(PacketFormat):
             return None
         version = f"{data[2]}.{data[3]}"
         return f"Hesai with {data[LASERS_AT]} lasers (protocol {version}, unit {data[UNIT_AT]} mm)"
-
-
-__all__ = ["DUAL", "HesaiFormat"]

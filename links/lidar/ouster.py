@@ -35,15 +35,15 @@ class Entries(NamedTuple):
     range_bytes: int
     range_mask: int
     range_unit_mm: int
-    reflectivity: int
-    second: tuple[int, int] | None = None  # positions of the second return's range and reflectivity
+    reflectivity_after_range: int
+    second_range: int | None = None  # position of the second return's range; its reflectivity follows likewise
 
 
 ENTRIES = {
     "LEGACY": Entries(0, 16, None, 12, 4, 0xFFFFF, 1, 4),
     "RNG19_RFL8_SIG16_NIR16": Entries(32, 12, STATUS_IN_COLUMN, 12, 4, 0x7FFFF, 1, 4),
     "RNG15_RFL8_NIR8": Entries(32, 12, STATUS_IN_COLUMN, 4, 2, 0x7FFF, 8, 2),
-    "RNG19_RFL8_SIG16_NIR16_DUAL": Entries(32, 12, STATUS_IN_COLUMN, 16, 4, 0x7FFFF, 1, 3, (4, 7)),
+    "RNG19_RFL8_SIG16_NIR16_DUAL": Entries(32, 12, STATUS_IN_COLUMN, 16, 4, 0x7FFFF, 1, 3, 4),
 }
 
 
@@ -74,10 +74,9 @@ class OusterFormat(PacketFormat):
         layout[columns.ENTRY_BYTES] = entries.entry_bytes
         layout[columns.RANGE_BYTES] = entries.range_bytes
         layout[columns.RANGE_MASK] = entries.range_mask
-        layout[columns.RANGE_IN_ENTRY] = 0
-        layout[columns.REFLECTIVITY_IN_ENTRY] = entries.reflectivity
-        if entries.second is not None:
-            layout[columns.SECOND_RANGE_IN_ENTRY], layout[columns.SECOND_REFLECTIVITY_IN_ENTRY] = entries.second
+        layout[columns.REFLECTIVITY_AFTER_RANGE] = entries.reflectivity_after_range
+        if entries.second_range is not None:
+            layout[columns.SECOND_RANGE_IN_ENTRY] = entries.second_range
         super().__init__(profile, beams, 1, layout)
         self.scales = np.array([1e-3 * entries.range_unit_mm, 1e-3 * beams.origin_mm, math.pi / 2])
         self.packet_bytes = 2 * entries.packet_head_bytes + beams.columns_per_packet * int(layout[columns.BLOCK_BYTES])
@@ -120,7 +119,7 @@ class OusterFormat(PacketFormat):
     def return_mode(self, data: bytes) -> str:
         """See PacketFormat."""
         del data
-        return "strongest" if self.entries.second is None else "dual"
+        return "strongest" if self.entries.second_range is None else "dual"
 
     def other_model(self, data: bytes) -> str | None:
         """See PacketFormat."""

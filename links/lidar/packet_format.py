@@ -120,6 +120,5 @@ def block_layout(
     layout[columns.ENTRY_BYTES] = entry_bytes
     layout[columns.RANGE_BYTES] = 2
     layout[columns.RANGE_MASK] = 0xFFFF
-    layout[columns.RANGE_IN_ENTRY] = 0
-    layout[columns.REFLECTIVITY_IN_ENTRY] = 2
+    layout[columns.REFLECTIVITY_AFTER_RANGE] = 2
     return layout

@@ -72,7 +72,7 @@ def import_file(
     """Convert a .pcap or .tlog to a recording next to it (or at `out`).
 
     `port` (None: the model's own) and `sender` (IPv4 address) choose the lidar in a capture; `rig_yaml` is the text of
-    its calibration, by default DEFAULT_RIG for a capture and none for a telemetry log. Without a rig the packets tell
+    its calibration, by default DEFAULT_RIG for a capture and none for a telemetry log. Without a rig the packets name
     the model; an Ouster's do not. LinkError when the file has no usable record; a
     partial output is removed.
     """

@@ -4,14 +4,16 @@ Lasers are listed in the packet's order. Elevations are above the plane across t
 the sense of rotation, clockwise seen from +z. An Ouster's elevations are nominal: each unit has its own
 (`stages/geometry/rig_lidar.py`).
 
-Sources: the manual of each model, `LidarProfile.source`. Footprints of the Velodyne models: VLS-128 user manual
-63-9483, table F-1, the same family's optics.
+Sources: the page of each model's manual, `LidarProfile.source`. Footprints of the Velodyne models: VLS-128 user manual
+63-9483, table F-1 (https://www.easymanua.ls/velodyne/vls-128/manual?p=115), the same family's optics. Not read in a
+manual: every `range_at_10_percent_m`; limits, accuracy and footprint of the Hesai XT and the Ouster. The simulated
+sensor uses them; the decoders need none of them.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
@@ -53,7 +55,7 @@ class LidarProfile:
     azimuth_deg: tuple[float, ...] = ()  # offset of each laser; none
     vertical_offset_mm: tuple[float, ...] = ()  # of each laser's origin along the spin axis; none
     origin_mm: float = 0.0  # horizontal distance of the lasers' origins from the spin axis
-    range_at_10_percent_m: float = 65.0  # half of the pulses on a 10 % target return; a VLP-16's where not stated
+    range_at_10_percent_m: float = 65.0  # half of the pulses on a 10 % target return
     turns_while_firing: bool = True  # a packet's azimuth is that of the first laser; False: of all lasers
 
     @property
@@ -72,10 +74,7 @@ def lidar_profile(model: str) -> LidarProfile:
     return _PROFILES[model]
 
 
-_VELODYNE_MODES = ("strongest", "last", "dual")
-_DELAYS_16 = tuple(2_304 * k for k in range(16))
 _UNIFORM_3_CM = 0.03 / math.sqrt(3)
-_VLP_FOOTPRINT_RAD = (3.0e-3, 1.5e-3)
 
 _VLP_32C_DEG = (
     *(-25.0, -1.0, -1.667, -15.639, -11.31, 0.0, -0.667, -8.843),
@@ -111,48 +110,51 @@ def _ouster(model: str, lasers: int, half_fov_deg: float, origin_mm: float, min_
     )
 
 
+_VLP_16 = LidarProfile(
+    model="VLP-16",  # and Puck LITE: the same angles and product id
+    source="https://www.easymanua.ls/velodyne/vlp-16/manual?p=54",  # table 9-1
+    elevation_deg=(-15, 1, -13, 3, -11, 5, -9, 7, -7, 9, -5, 11, -3, 13, -1, 15),
+    vertical_offset_mm=(11.2, -0.7, 9.7, -2.2, 8.1, -3.7, 6.6, -5.1, 5.1, -6.6, 3.7, -8.1, 2.2, -9.7, 0.7, -11.2),
+    firing_ns=tuple(2_304 * k for k in range(16)),
+    sequence_ns=55_296,
+    range_unit_mm=2,
+    min_range_m=0.5,
+    max_range_m=105.0,
+    range_sigma_m=_UNIFORM_3_CM,
+    footprint_rad=(3.0e-3, 1.5e-3),
+    spin_hz=(5.0, 20.0),
+    return_modes=("strongest", "last", "dual"),
+    product_id=0x22,
+)
+_XT16 = LidarProfile(
+    model="XT16",
+    source="https://www.manualslib.com/manual/2964355/Hesai-Pandarxt-16.html",  # appendices I and II
+    elevation_deg=tuple(float(15 - 2 * k) for k in range(16)),
+    firing_ns=tuple(3_024 * k for k in range(16)),
+    sequence_ns=50_000,
+    range_unit_mm=4,
+    min_range_m=0.05,
+    max_range_m=120.0,
+    range_sigma_m=0.01 / math.sqrt(3),
+    footprint_rad=(1.5e-3, 1.5e-3),
+    spin_hz=(5.0, 20.0),
+    return_modes=("strongest", "last", "dual"),
+    range_at_10_percent_m=80.0,
+    turns_while_firing=False,
+)
 _PROFILES: dict[str, LidarProfile] = {
     profile.model: profile
     for profile in (
-        LidarProfile(
-            model="VLP-16",  # and Puck LITE: the same angles and product id
-            source="https://velodynelidar.com/wp-content/uploads/2019/12/63-9243-Rev-E-VLP-16-User-Manual.pdf",
-            elevation_deg=(-15, 1, -13, 3, -11, 5, -9, 7, -7, 9, -5, 11, -3, 13, -1, 15),  # table 9-1
-            vertical_offset_mm=(
-                *(11.2, -0.7, 9.7, -2.2, 8.1, -3.7, 6.6, -5.1),
-                *(5.1, -6.6, 3.7, -8.1, 2.2, -9.7, 0.7, -11.2),
-            ),
-            firing_ns=_DELAYS_16,
-            sequence_ns=55_296,
-            range_unit_mm=2,
-            min_range_m=0.5,
-            max_range_m=105.0,
-            range_sigma_m=_UNIFORM_3_CM,
-            footprint_rad=_VLP_FOOTPRINT_RAD,
-            spin_hz=(5.0, 20.0),
-            return_modes=_VELODYNE_MODES,
-            product_id=0x22,
-        ),
-        LidarProfile(
-            model="Puck Hi-Res",
-            source="https://velodynelidar.com/wp-content/uploads/2019/12/63-9318-Rev-E-Puck-Hi-Res-Manual.pdf",
+        _VLP_16,
+        replace(
+            _VLP_16,
+            model="Puck Hi-Res",  # same manual and table
             elevation_deg=tuple(round(w, 3) for k in range(8) for w in (-10 + 4 * k / 3, 2 / 3 + 4 * k / 3)),
-            vertical_offset_mm=(
-                *(7.4, -0.9, 6.5, -1.8, 5.5, -2.7, 4.6, -3.7),
-                *(3.7, -4.6, 2.7, -5.5, 1.8, -6.5, 0.9, -7.4),
-            ),
-            firing_ns=_DELAYS_16,
-            sequence_ns=55_296,
-            range_unit_mm=2,
-            min_range_m=0.5,
-            max_range_m=105.0,
-            range_sigma_m=_UNIFORM_3_CM,
-            footprint_rad=_VLP_FOOTPRINT_RAD,
-            spin_hz=(5.0, 20.0),
-            return_modes=_VELODYNE_MODES,
+            vertical_offset_mm=(7.4, -0.9, 6.5, -1.8, 5.5, -2.7, 4.6, -3.7, 3.7, -4.6, 2.7, -5.5, 1.8, -6.5, 0.9, -7.4),
             product_id=0x24,
         ),
-        LidarProfile(
+        replace(
+            _VLP_16,
             model="VLP-32C",
             source="https://docslib.org/doc/7045953/vlp-32c-user-manual-63-9325-rev",  # tables 9-2 and 9-6
             elevation_deg=_VLP_32C_DEG,
@@ -162,63 +164,29 @@ _PROFILES: dict[str, LidarProfile] = {
             ),
             vertical_offset_mm=_from_focus(42.4, _VLP_32C_DEG),  # envelope drawing 86-0130: distance of the focal point
             firing_ns=tuple(2_304 * (k // 2) for k in range(32)),  # lasers fire in pairs
-            sequence_ns=55_296,
             range_unit_mm=4,
-            min_range_m=0.5,
             max_range_m=200.0,
-            range_sigma_m=_UNIFORM_3_CM,
-            footprint_rad=_VLP_FOOTPRINT_RAD,
-            spin_hz=(5.0, 20.0),
-            return_modes=_VELODYNE_MODES,
             product_id=0x28,
         ),
-        LidarProfile(
+        replace(
+            _VLP_16,
             model="HDL-32E",
             source="https://manualsdump.com/amp/en/manuals/275446/20",  # appendices B and E
             elevation_deg=_HDL_32E_DEG,
             vertical_offset_mm=_from_focus(28.96, _HDL_32E_DEG),
             firing_ns=tuple(1_152 * k for k in range(32)),
             sequence_ns=46_080,
-            range_unit_mm=2,
-            min_range_m=0.5,
             max_range_m=100.0,
             range_sigma_m=0.02 / math.sqrt(3),
-            footprint_rad=_VLP_FOOTPRINT_RAD,
-            spin_hz=(5.0, 20.0),
-            return_modes=_VELODYNE_MODES,
             product_id=0x21,
         ),
-        LidarProfile(
-            model="XT16",
-            source="https://www.manualslib.com/manual/2964355/Hesai-Pandarxt-16.html",  # appendices I and II
-            elevation_deg=tuple(float(15 - 2 * k) for k in range(16)),
-            firing_ns=tuple(3_024 * k for k in range(16)),
-            sequence_ns=50_000,
-            range_unit_mm=4,
-            min_range_m=0.05,
-            max_range_m=120.0,
-            range_sigma_m=0.01 / math.sqrt(3),
-            footprint_rad=(1.5e-3, 1.5e-3),
-            spin_hz=(5.0, 20.0),
-            return_modes=_VELODYNE_MODES,
-            range_at_10_percent_m=80.0,
-            turns_while_firing=False,
-        ),
-        LidarProfile(
+        _XT16,
+        replace(
+            _XT16,
             model="XT32",
             source="https://manualshive.com/en/manual/hesai/pandarxt/2127257?page=34",  # section 3.1, appendices I, II
             elevation_deg=tuple(float(15 - k) for k in range(32)),
             firing_ns=tuple(1_512 * k for k in range(32)),
-            sequence_ns=50_000,
-            range_unit_mm=4,
-            min_range_m=0.05,
-            max_range_m=120.0,
-            range_sigma_m=0.01 / math.sqrt(3),
-            footprint_rad=(1.5e-3, 1.5e-3),
-            spin_hz=(5.0, 20.0),
-            return_modes=_VELODYNE_MODES,
-            range_at_10_percent_m=80.0,
-            turns_while_firing=False,
         ),
         *(_ouster("OS0", lasers, 45.0, 27.67, 0.3) for lasers in (32, 64, 128)),
         *(_ouster("OS1", lasers, 22.5, 15.806, 0.3) for lasers in (32, 64, 128)),

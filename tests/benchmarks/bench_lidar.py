@@ -76,11 +76,12 @@ def test_ours_whole_decode_dual(benchmark, records):
 def test_ours_kernel(benchmark, records):
     sizes = (np.int64, np.uint8, np.float32, np.float32, np.uint8, np.uint8)
     form = packet_format("VLP-16")
-    arrays = [np.empty(form.max_rows, dtype) for dtype in sizes] + [np.empty((form.max_rows, 3), np.float32)]
+    arrays = [np.empty(form.max_rows, dtype) for dtype in sizes]
+    rows = [*arrays, np.empty((form.max_rows, 3), np.float32)]
 
     def run():
         for record in records:
-            decode(record.data, record.stamp_ns, form.layout, form.scales, form.pulses, *arrays)
+            decode(record.data, record.stamp_ns, False, form.layout, form.scales, form.pulses, 0, *rows)
 
     benchmark(run)
 

@@ -79,6 +79,22 @@ class PacketEncoder:
             raise ValueError(f"{self.mode} packets take ranges {shape}, got {range_m.shape}")
         return np.rint(1000 * range_m / unit_mm).astype(np.int64)
 
+    def _fill_blocks(
+        self,
+        blocks: NDArray[np.void],
+        azimuth_rad: NDArray[np.float64],
+        counts: NDArray[np.int64],
+        reflectivity: NDArray[np.uint8],
+    ) -> None:
+        """Azimuths and entries of blocks; in dual mode the last return is in blocks 0, 2, ..."""
+        channels = blocks["channels"]
+        for kind in range(self.returns):
+            rows = slice(self.returns - 1 - kind, None, self.returns)
+            shape = channels["range"][rows].shape
+            blocks["azimuth"][rows] = _hundredths(azimuth_rad)
+            channels["range"][rows] = counts[kind].reshape(shape)
+            channels["reflectivity"][rows] = np.where(counts > 0, reflectivity, 0)[kind].reshape(shape)
+
     def _velodyne(
         self,
         first_pulse_ns: int,
@@ -89,15 +105,8 @@ class PacketEncoder:
         """Manual, section 9.3. The packet holds its microsecond past the hour, rounded down."""
         counts = self._counts(range_m, self.profile.range_unit_mm)
         packet = np.zeros((), dtype=_VELODYNE)
-        blocks = packet["blocks"]
-        blocks["flag"] = 0xEEFF
-        per_block = 32 // self.profile.lasers
-        hundredths = _hundredths(azimuth_rad[::per_block])
-        for kind in range(self.returns):
-            rows = slice(self.returns - 1 - kind, None, self.returns)  # dual: last in blocks 0, 2, ..
-            blocks["azimuth"][rows] = hundredths
-            blocks["channels"]["range"][rows] = counts[kind].reshape(-1, 32)
-            blocks["channels"]["reflectivity"][rows] = np.where(counts > 0, reflectivity, 0)[kind].reshape(-1, 32)
+        packet["blocks"]["flag"] = 0xEEFF
+        self._fill_blocks(packet["blocks"], azimuth_rad[:: 32 // self.profile.lasers], counts, reflectivity)
         packet["timestamp_us"] = first_pulse_ns // 1000 % HOUR_US
         packet["mode"] = RETURN_MODE_BYTE[self.mode]
         packet["product"] = self.profile.product_id
@@ -114,11 +123,7 @@ class PacketEncoder:
         lasers = self.profile.lasers
         counts = self._counts(range_m, self.profile.range_unit_mm)
         blocks = np.zeros(8, dtype=[("azimuth", "<u2"), ("channels", _XT_CHANNEL, lasers)])
-        for kind in range(self.returns):
-            rows = slice(self.returns - 1 - kind, None, self.returns)
-            blocks["azimuth"][rows] = _hundredths(azimuth_rad)
-            blocks["channels"]["range"][rows] = counts[kind]
-            blocks["channels"]["reflectivity"][rows] = np.where(counts > 0, reflectivity, 0)[kind]
+        self._fill_blocks(blocks, azimuth_rad, counts, reflectivity)
         end_ns = first_pulse_ns + 50_000 * (self.sequences - 1) - 5_632 - 368
         at = datetime.datetime.fromtimestamp(end_ns // 1_000_000_000, datetime.UTC)
         tail = np.zeros((), dtype=_TAIL)

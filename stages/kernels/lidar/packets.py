@@ -8,6 +8,7 @@ of a block. Source: see `links/lidar/decode.py`.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,16 +35,27 @@ Integers = NDArray[np.int64]
     ENTRY_BYTES,
     RANGE_BYTES,  # 2 or 4, little endian
     RANGE_MASK,
-    RANGE_IN_ENTRY,
-    REFLECTIVITY_IN_ENTRY,
+    REFLECTIVITY_AFTER_RANGE,  # from the range, with which an entry begins
     SECOND_RANGE_IN_ENTRY,  # dual return; -1: pairs of blocks hold the last and the strongest return
-    SECOND_REFLECTIVITY_IN_ENTRY,
     LAYOUT,
-) = range(18)
+) = range(16)
 RANGE_UNIT_M, ORIGIN_M, AZIMUTH_ZERO_RAD, SCALES = range(4)
 """SCALES: floats. Unit of a range, distance of the lasers' origins from the axis, azimuth at count 0."""
 COS_ELEVATION, SIN_ELEVATION, Z_OFFSET_M, AZIMUTH_OFFSET_RAD, TURN_NS, DELAY_NS, LASER, PULSE_COLUMNS = range(8)
 """Columns of a pulse: TURN_NS is the time by which the rotor has turned on since the block's azimuth was read."""
+
+
+class Rows(NamedTuple):
+    """Columns of a LidarFirings message: one row per pulse and return."""
+
+    pulse_stamp_ns: Integers
+    laser: Bytes
+    azimuth_rad: Floats
+    range_m: Floats
+    reflectivity: Bytes
+    return_kind: Bytes
+    xyz_lidar_m: Floats
+
 
 KIND_STRONGEST, KIND_LAST = 0, 1  # every pulse has one row of the first kind: its strongest or its only return
 _TAU_F32 = np.float32(math.tau)
@@ -99,17 +111,11 @@ def _decode_blocks(
     first_block: int,
     block_step: int,
     range_in_entry: int,
-    reflectivity_in_entry: int,
     kind: int,
-    pulse_stamp_ns: Integers,
-    laser: Bytes,
-    azimuth_rad: Floats,
-    range_m: Floats,
-    reflectivity: Bytes,
-    return_kind: Bytes,
-    xyz_lidar_m: Floats,
+    rows: Rows,
+    row: int,
 ) -> int:
-    """Fill a row for each entry of every `block_step`th block; returns their number."""
+    """Fill a row for each entry of every `block_step`th block, from `row` on; returns the row after the last."""
     count, block_ns, unit_m, origin_m = len(pulses), layout[BLOCK_NS], scales[RANGE_UNIT_M], scales[ORIGIN_M]
     azimuth_unit_rad, time_at, wide, mask = (
         math.tau / layout[AZIMUTH_TURN],
@@ -125,7 +131,7 @@ def _decode_blocks(
         turn_rad[j] = rate * pulses[j, TURN_NS] / block_ns * azimuth_unit_rad + pulses[j, AZIMUTH_OFFSET_RAD]
         cos_turn[j], sin_turn[j] = math.cos(turn_rad[j]), math.sin(turn_rad[j])
 
-    rows = 0
+    shade_at = layout[REFLECTIVITY_AFTER_RANGE]
     for number, block in enumerate(range(first_block, layout[BLOCKS], block_step)):
         block_at = layout[FIRST_BLOCK_AT] + block * layout[BLOCK_BYTES]
         if not _valid(data, block_at, layout[STATUS_IN_BLOCK]):
@@ -140,47 +146,46 @@ def _decode_blocks(
             block_stamp_ns = stamp_ns + (time_ns - first_ns)
         entries_at = block_at + layout[FIRST_ENTRY_IN_BLOCK]
         for j in range(count):
-            row = rows + j
-            at = entries_at + j * layout[ENTRY_BYTES]
-            range_at = at + range_in_entry
+            range_at = entries_at + j * layout[ENTRY_BYTES] + range_in_entry
             counts = _u16(data, range_at)
             if wide:
                 counts |= _u16(data, range_at + 2) << 16
             r: float = (counts & mask) * unit_m
-            range_m[row] = r
-            reflectivity[row] = data[at + reflectivity_in_entry]
+            rows.range_m[row + j] = r
+            rows.reflectivity[row + j] = data[range_at + shade_at]
             level = r - origin_m if r > 0.0 else 0.0
             x = level * pulses[j, COS_ELEVATION] * (sin_block * cos_turn[j] + cos_block * sin_turn[j])
             y = level * pulses[j, COS_ELEVATION] * (cos_block * cos_turn[j] - sin_block * sin_turn[j])
             if origin_m > 0.0 and r > 0.0:  # the beams start beside the axis
                 x += origin_m * sin_block
                 y += origin_m * cos_block
-            xyz_lidar_m[row, 0] = x
-            xyz_lidar_m[row, 1] = y
-            xyz_lidar_m[row, 2] = level * pulses[j, SIN_ELEVATION] + pulses[j, Z_OFFSET_M] if r > 0.0 else 0.0
+            rows.xyz_lidar_m[row + j, 0] = x
+            rows.xyz_lidar_m[row + j, 1] = y
+            rows.xyz_lidar_m[row + j, 2] = level * pulses[j, SIN_ELEVATION] + pulses[j, Z_OFFSET_M] if r > 0.0 else 0.0
         for j in range(count):
-            row = rows + j
             angle_rad = block_rad + turn_rad[j]
             if angle_rad < 0.0:
                 angle_rad += math.tau
             elif angle_rad >= math.tau:
                 angle_rad -= math.tau
             rounded = np.float32(angle_rad)
-            azimuth_rad[row] = rounded if rounded < _TAU_F32 else np.float32(0.0)
-            pulse_stamp_ns[row] = block_stamp_ns + np.int64(pulses[j, DELAY_NS])
-            laser[row] = np.uint8(pulses[j, LASER])
-            return_kind[row] = kind
-        rows += count
-    return rows
+            rows.azimuth_rad[row + j] = rounded if rounded < _TAU_F32 else np.float32(0.0)
+            rows.pulse_stamp_ns[row + j] = block_stamp_ns + np.int64(pulses[j, DELAY_NS])
+            rows.laser[row + j] = np.uint8(pulses[j, LASER])
+            rows.return_kind[row + j] = kind
+        row += count
+    return row
 
 
 @compiled
 def decode(
     data: bytes,
     stamp_ns: int,
+    dual: bool,
     layout: Integers,
     scales: Array64,
     pulses: Array64,
+    first_row: int,
     pulse_stamp_ns: Integers,
     laser: Bytes,
     azimuth_rad: Floats,
@@ -189,101 +194,50 @@ def decode(
     return_kind: Bytes,
     xyz_lidar_m: Floats,
 ) -> int:
-    """Single return: fill a row for each entry; returns their number, 0 if the azimuths are invalid."""
-    rate = _rotation(data, False, layout)
-    if np.isnan(rate):
-        return 0
-    return _decode_blocks(
-        data,
-        stamp_ns,
-        layout,
-        scales,
-        pulses,
-        rate,
-        0,
-        1,
-        layout[RANGE_IN_ENTRY],
-        layout[REFLECTIVITY_IN_ENTRY],
-        KIND_STRONGEST,
-        pulse_stamp_ns,
-        laser,
-        azimuth_rad,
-        range_m,
-        reflectivity,
-        return_kind,
-        xyz_lidar_m,
-    )
+    """Fill the rows of a packet's returns, from first_row on; returns their number, 0 if the azimuths are invalid.
 
-
-@compiled
-def decode_dual(
-    data: bytes,
-    stamp_ns: int,
-    layout: Integers,
-    scales: Array64,
-    pulses: Array64,
-    pulse_stamp_ns: Integers,
-    laser: Bytes,
-    azimuth_rad: Floats,
-    range_m: Floats,
-    reflectivity: Bytes,
-    return_kind: Bytes,
-    xyz_lidar_m: Floats,
-) -> int:
-    """Dual return: as `decode`, the two returns of each pulse as neighbours; returns the number of rows.
-
-    Even blocks hold the last return, odd ones the strongest, or an entry holds both. A pulse gets a row for its
-    strongest or only return, and a second one where its last return is another.
+    Dual return: even blocks hold the last return and odd ones the strongest, or an entry holds both. A pulse gets a row
+    for its strongest or only return, and a second one after it where its last return is another.
     """
-    in_pairs = layout[SECOND_RANGE_IN_ENTRY] < 0
+    rows = Rows(pulse_stamp_ns, laser, azimuth_rad, range_m, reflectivity, return_kind, xyz_lidar_m)
+    second = layout[SECOND_RANGE_IN_ENTRY]
+    in_pairs = dual and second < 0
     rate = _rotation(data, in_pairs, layout)
     if np.isnan(rate):
         return 0
+    if not dual:
+        end = _decode_blocks(data, stamp_ns, layout, scales, pulses, rate, 0, 1, 0, KIND_STRONGEST, rows, first_row)
+        return end - first_row
     size = layout[BLOCKS] * len(pulses)
-    stamp_ = np.empty((2, size), np.int64)
-    laser_, shade_, kind_ = np.empty((2, size), np.uint8), np.empty((2, size), np.uint8), np.empty((2, size), np.uint8)
-    azimuth_, range_ = np.empty((2, size), np.float32), np.empty((2, size), np.float32)
-    xyz_ = np.empty((2, size, 3), np.float32)
+    both = Rows(
+        np.empty(2 * size, np.int64),
+        np.empty(2 * size, np.uint8),
+        np.empty(2 * size, np.float32),
+        np.empty(2 * size, np.float32),
+        np.empty(2 * size, np.uint8),
+        np.empty(2 * size, np.uint8),
+        np.empty((2 * size, 3), np.float32),
+    )
     count = 0
-    for last in range(2):
-        first, step = (1 - last, 2) if in_pairs else (0, 1)
-        second = last == 1 and not in_pairs
-        range_at = layout[SECOND_RANGE_IN_ENTRY] if second else layout[RANGE_IN_ENTRY]
-        shade_at = layout[SECOND_REFLECTIVITY_IN_ENTRY] if second else layout[REFLECTIVITY_IN_ENTRY]
-        count = _decode_blocks(
-            data,
-            stamp_ns,
-            layout,
-            scales,
-            pulses,
-            rate,
-            first,
-            step,
-            range_at,
-            shade_at,
-            last,
-            stamp_[last],
-            laser_[last],
-            azimuth_[last],
-            range_[last],
-            shade_[last],
-            kind_[last],
-            xyz_[last],
+    for kind in (KIND_STRONGEST, KIND_LAST):
+        first_block, step = (1 - kind, 2) if in_pairs else (0, 1)
+        range_at = second if kind == KIND_LAST and not in_pairs else 0
+        end = _decode_blocks(
+            data, stamp_ns, layout, scales, pulses, rate, first_block, step, range_at, kind, both, kind * size
         )
-    rows = 0
+        count = end - kind * size
+    row = first_row
     for pulse in range(count):
-        strongest, last = range_[0, pulse], range_[1, pulse]
-        for which in range(2):
-            if which == 1 and (last == 0 or last == strongest or strongest == 0):
-                continue
-            source = 1 if which == 0 and strongest == 0 and last != 0 else which
-            pulse_stamp_ns[rows] = stamp_[source, pulse]
-            laser[rows] = laser_[source, pulse]
-            azimuth_rad[rows] = azimuth_[source, pulse]
-            range_m[rows] = range_[source, pulse]
-            reflectivity[rows] = shade_[source, pulse]
-            return_kind[rows] = which
+        strongest, last = both.range_m[pulse], both.range_m[size + pulse]
+        for kind in range(2 if 0 != last != strongest != 0 else 1):
+            source = pulse + size * (kind == KIND_LAST or (strongest == 0 and last != 0))
+            rows.pulse_stamp_ns[row] = both.pulse_stamp_ns[source]
+            rows.laser[row] = both.laser[source]
+            rows.azimuth_rad[row] = both.azimuth_rad[source]
+            rows.range_m[row] = both.range_m[source]
+            rows.reflectivity[row] = both.reflectivity[source]
+            rows.return_kind[row] = kind
             for axis in range(3):
-                xyz_lidar_m[rows, axis] = xyz_[source, pulse, axis]
-            rows += 1
-    return rows
+                rows.xyz_lidar_m[row, axis] = both.xyz_lidar_m[source, axis]
+            row += 1
+    return row - first_row

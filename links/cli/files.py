@@ -5,6 +5,7 @@ Source: DESIGN, Command line.
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -157,6 +158,12 @@ def recover_recording(
         raise typer.Exit(EXIT_FAILED)
 
 
+def _size(text: str) -> str:
+    if not re.fullmatch(r"[1-9]\d{1,4}x[1-9]\d{1,4}", text):
+        raise typer.BadParameter(f"{text} is not WIDTHxHEIGHT in pixels, as 1920x1080 is.")
+    return text
+
+
 @report_errors
 def view(
     rrd: Annotated[Path, typer.Argument(help="The run.rrd of a run.")],
@@ -166,7 +173,9 @@ def view(
     ] = None,
     at: Annotated[float, typer.Option("--at", min=0, max=1, help="Time of the image, as a fraction of the run.")] = 0.9,
     tab: Annotated[str | None, typer.Option("--tab", help="Tab in the image [default: Overview].")] = None,
-    size: Annotated[str, typer.Option("--size", metavar="WxH", help="Size of the image [px].")] = "1920x1080",
+    size: Annotated[
+        str, typer.Option("--size", metavar="WxH", callback=_size, help="Size of the image [px].")
+    ] = "1920x1080",
 ) -> None:
     """Open a run in the Rerun viewer, or write a screenshot of it.
 
@@ -177,6 +186,8 @@ def view(
     from links.viewer import screenshot, show
 
     if png is None:
+        if tab is not None:
+            raise LinkError("--tab selects the tab of an image: add --screenshot FILE.png")
         show(rrd)
         return
     errors = screenshot(rrd, png, at=at, tab=tab, size=size)

@@ -73,6 +73,8 @@ def run(
 
     Example: grd run configs/quickstart.yaml --set track.radius_m=0.8
     """
+    if config.suffix == ".mcap":
+        raise LinkError(f"{config} is a recording: grd replay {config}")
     recording = recording_named(config, overlay or (), sets or ())
     if (hosts is None) is not (host is None):
         raise LinkError("--hosts FILE and --host NAME go together: FILE places stages on hosts, NAME is this host")

@@ -13,7 +13,7 @@ import typer
 from flow.link import LinkError
 from links.cli.console import EXIT_FAILED, EXIT_USAGE, err, out, progress_bar, report_errors, warn
 from links.cli.files import Overwrite
-from links.runs.shipped import shipped, shipped_option
+from links.runs.shipped import shipped, shipped_all, shipped_option
 from stages.geometry.lidar_models import LIDAR_MODELS
 
 if TYPE_CHECKING:  # the simulator is an optional dependency
@@ -227,9 +227,14 @@ def _not_installed(missing: ModuleNotFoundError) -> LinkError:
 
 @report_errors
 def fly_scenarios(
-    scenarios: Annotated[list[Path], typer.Argument(help="Scenarios with an autopilot in the loop.")],
+    scenarios: Annotated[
+        list[Path], typer.Argument(callback=shipped_all, help="Scenarios with an autopilot in the loop.")
+    ],
     closed_loop: Annotated[
-        Path, typer.Option("--closed-loop", metavar="CONFIG", help="Configuration on whose poses the drone flies.")
+        Path,
+        typer.Option(
+            "--closed-loop", metavar="CONFIG", callback=shipped, help="Configuration on whose poses the drone flies."
+        ),
     ],
     folder: Annotated[Path, typer.Option("--out", "-o", help="Folder for the outcomes and the table.")],
     seeds: Annotated[int, typer.Option("--seeds", min=1, max=1000, help="Number of seeds per scenario.")] = 3,
@@ -252,7 +257,7 @@ def fly_scenarios(
         from links.simulated.matrix.flight_runs import fly_all
         from links.simulated.matrix.flight_table import markdown_table, write_csv
     except ModuleNotFoundError as missing:
-        raise LinkError(f"simulating needs '{missing.name}', not installed: pip install -e '.[simulate]'") from None
+        raise _not_installed(missing) from None
 
     several = range(first_seed, first_seed + seeds)
     with progress_bar(f"{len(scenarios) * seeds} flights") as step:

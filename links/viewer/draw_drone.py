@@ -89,10 +89,11 @@ def detections(message: Detections, name: str, scene: ViewerScene) -> Entities:
         labels = [f"candidate {numbers[k]}, {confidence[k]}: {message.reasons[k]}" for k in np.flatnonzero(chosen)]
         points = rr.Points3D(xyz_m, colors=colour, radii=rr.Radius.ui_points(5.0), labels=labels, show_labels=False)
         yield Entity(f"vehicle/{name}/{kind}", points, frame="vehicle")
+        heads = [text.split(",")[0] for text in labels]
         if scene.depth is not None:
-            yield _rings(scene, f"overlays/{name}/{kind}", xyz_m, labels, colour, show_labels=kind == "accepted")
+            yield _rings(scene, f"overlays/{name}/{kind}", xyz_m, heads, colour, show_labels=kind == "accepted")
         if kind == "accepted" and isinstance(evidence, KernelScores):  # else Candidates draws its current position
-            yield label(name, xyz_m, [text.split(",")[0] for text in labels], colour)
+            yield label(name, xyz_m, heads, colour)
     if isinstance(evidence, CandidateEvidence):
         percent = 100.0 * evidence.probability
         best = [percent[chosen].max(initial=0.0) for chosen in (message.accepted, ~message.accepted)]

@@ -13,6 +13,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from flow.message import port_name
 from links.evaluation.association import interpolate
 from links.mavlink.poses.position_gate import gate_reason
 from links.viewer import colours
@@ -34,6 +35,7 @@ from stages.messages import (
     AutopilotEstimator,
     BranchState,
     CameraMount,
+    DroneFix,
     HeadingEstimate,
     PoseEstimate,
     PoseState,
@@ -64,6 +66,8 @@ GATE_COLOURS = np.array(
     [colours.BAD, colours.DRONE, colours.CANDIDATE, colours.COASTING, colours.VERTICAL], dtype=np.uint32
 )
 GATE_TOP = 3.0  # larger shares are drawn here: what matters is on which side of the limit they are
+UNKNOWN = np.full(3, math.nan)
+ERROR_GAP_NS = 1_000_000_000  # the curve of an error is interrupted where the position is unknown for longer
 TrueTrack = tuple[NDArray[np.int64], Array64]  # stamps (n,) and positions (n, 3) of a drone, vehicle frame
 AMBIGUOUS_AXES = (colours.AXES & np.uint32(0xFFFFFF00)) | np.uint32(0x60)
 
@@ -81,14 +85,14 @@ def relative_pose(message: RelativePose, name: str, scene: ViewerScene) -> Entit
     estimate = message.estimate
     if estimate is None:
         yield clear(f"vehicle/{name}")
+        yield from _position_curves(name, UNKNOWN, UNKNOWN)
         yield scene.status(6, stage_of(name), f"{state}: {message.reason}")
         return
     xyz_m, position_m2 = estimate.xyz_vehicle_m, position_covariance_vehicle_m2(estimate)
     scene.estimated(name, message.stamp_ns, xyz_m, position_m2)
     yield ellipsoids(f"vehicle/{name}/ellipsoid_95", xyz_m[None], position_m2[None], colours.NEUTRAL, filled=False)
-    yield plot(f"plots/position/{name}", xyz_m, [f"fused {axis}" for axis in AXES], colours.AXES, dots=False)
     sigma_m = np.sqrt(np.diag(position_m2))
-    yield plot(f"plots/sigma/{name}", sigma_m, [f"fused sigma {axis}" for axis in "xyz"], colours.AXES, dots=False)
+    yield from _position_curves(name, xyz_m, sigma_m)
     if math.isfinite(message.nis):
         yield plot(f"plots/other/{name}/nis", [message.nis], ["NIS of the newest fix, expected 3"])
     if message.measured_ns is not None:
@@ -115,6 +119,12 @@ def relative_pose(message: RelativePose, name: str, scene: ViewerScene) -> Entit
     yield scene.status(6, stage_of(name), f"{state}: {text}; {message.reason}")
 
 
+def _position_curves(name: str, xyz_m: Array64, sigma_m: Array64) -> Entities:
+    """Curves of the fused position and its sigmas; `UNKNOWN` interrupts them."""
+    yield plot(f"plots/position/{name}", xyz_m, [f"fused {axis}" for axis in AXES], colours.AXES, dots=False)
+    yield plot(f"plots/sigma/{name}", sigma_m, [f"fused sigma {axis}" for axis in "xyz"], colours.AXES, dots=False)
+
+
 def gate(message: RelativePose, name: str, gate: Gate, scene: ViewerScene) -> Entities:
     """Whether the autopilot's gate accepts a pose at its own time, or why not; each value as a share of its limit."""
     reason = gate_reason(message, message.stamp_ns, gate.limits, gate.yaw)
@@ -122,7 +132,7 @@ def gate(message: RelativePose, name: str, gate: Gate, scene: ViewerScene) -> En
     yield from state_change("states/autopilot_gate", state, scene)
     if scene.changed("log/autopilot_gate", state):
         text = "accepted" if reason is None else f"held back: {state}"
-        yield log_entry("to the autopilot", text, "INFO" if reason is None else "WARN")
+        yield log_entry("autopilot_gate", text, "INFO" if reason is None else "WARN")
     limits, estimate = gate.limits, message.estimate
     shares = [math.nan] * len(GATE_VALUES)
     if estimate is not None:
@@ -157,10 +167,15 @@ def errors_against(truths: Sequence[TrueTrack], scene: ViewerScene) -> Iterator[
             known, there_m = interpolate(at_ns, stamps_ns, true_m, TRUTH_GAP_NS)
             distances[row, known] = np.linalg.norm(xyz_m - there_m, axis=1)[known]
         nearest = np.nanmin(np.where(np.isnan(distances), np.inf, distances), axis=0, initial=np.inf)
+        path, names = f"plots/error/{name}", [f"{name}: error", f"{name}: sigma"]
+        dots, last_ns = name.endswith(port_name(DroneFix)), None
         for estimate, error_m in zip(estimates, nearest.tolist(), strict=True):
-            if math.isfinite(error_m):
-                names = [f"{name}: error", f"{name}: sigma"]
-                yield estimate.stamp_ns, plot(f"plots/error/{name}", [error_m, estimate.sigma_m], names, ERROR_COLOURS)
+            if not math.isfinite(error_m):
+                continue
+            if last_ns is not None and estimate.stamp_ns - last_ns > ERROR_GAP_NS:
+                yield last_ns + 1, plot(path, UNKNOWN[:2], names, ERROR_COLOURS, dots=dots)
+            last_ns = estimate.stamp_ns
+            yield last_ns, plot(path, [error_m, estimate.sigma_m], names, ERROR_COLOURS, dots=dots)
 
 
 def position_covariance_vehicle_m2(estimate: PositionEstimate | PoseEstimate) -> Array64:
@@ -182,7 +197,7 @@ def heading_estimate(message: HeadingEstimate, name: str, scene: ViewerScene) ->
         z = colours.AXES[2:]
         yield plot(f"plots/rotation/{name}", [yaw_deg], ["most probable yaw"], z)
         yield plot(f"plots/rotation_sigma/{name}", [sigma_deg], ["sigma of the most probable yaw"], z)
-        yield plot(f"plots/branch/{name}", [near], ["yaw within 20 deg"], z, dots=False)
+        yield plot(f"plots/branch/{name}", [near], ["yaw within 20 deg"], MATCHES_COLOUR, dots=False)
 
 
 def relative_rotation(message: RelativeRotation, name: str, scene: ViewerScene) -> Entities:

@@ -14,6 +14,7 @@ import rerun.blueprint as rrb
 from links.viewer.scene import DRONE_FRAME, SPHERE_SPACING, TIMELINE, sphere_frame
 from stages.messages import CameraMount
 
+EDGES = "/plots/fields/run"  # `flow.live.report.EdgeStatus` of a live run
 _BACKGROUND = [12, 15, 22]
 Rows = list[tuple[int, rrb.View | rrb.Container]]  # views below each other, each with its share of the height
 _WHOLE_RUN = rrb.TimeAxis(
@@ -42,16 +43,24 @@ def layout(
     """
 
     def position() -> Rows:  # a view is in one place: each tab gets its own
-        return [(24, _curves("Position of the drone [m]", "/plots/position/**"))]
+        return [(24, _curves("Position [m]: x red, y green, z blue, truth dark", "/plots/position/**"))]
 
     def error() -> Rows:
-        return [(20, _curves("Error against the truth, with its sigma [m]", "/plots/error/**"))] if truth else []
+        return (
+            [(20, _curves("Error against the truth (red) and its sigma (grey) [m]", "/plots/error/**"))]
+            if truth
+            else []
+        )
+
+    gate_limits = "Gate, sent below red: position yellow, rotation violet, its age orange, yaw axis blue"
 
     def sent() -> Rows:
-        return [(15, _curves("Gate: share of each limit, sent below 1", "/plots/gate/**"))] if gate else []
+        return [(15, _curves(gate_limits, "/plots/gate/**"))] if gate else []
 
     def sigma() -> Rows:
-        return [(16, _curves("Sigma of the position [m]", "/plots/sigma/**"))]
+        return [
+            (16, _curves("Sigma of the position [m]: x red, y green, z blue, prediction orange", "/plots/sigma/**"))
+        ]
 
     images: Rows = [(32, rrb.Horizontal(*_image_views(vision)))] if vision.images else []
     overview = rrb.Horizontal(
@@ -60,7 +69,7 @@ def layout(
         name="Overview",
     )
     returns = _curves("Returns on the drone, per scan pass", "/plots/hits/**")
-    servo = _curves("Servo angle and goal [deg]", "/plots/servo/**")
+    servo = _curves("Servo [deg]: angle grey, goal blue, requested yellow", "/plots/servo/**")
     tracking = rrb.Horizontal(
         rrb.Vertical(_close_up(), _log(), row_shares=[3, 2]),
         _rows([*position(), *sigma(), (14, returns), (16, servo), *_states()]),
@@ -72,11 +81,13 @@ def layout(
     if vision.pose:
         tabs.append(_columns([*position(), *error(), *sigma(), *_rotation_views(), *_states()], name="Fusion"))
     if gate:
-        ekf = _curves("The autopilot's EKF: test ratios, rejected above 1", "/plots/estimator/**")
+        ekf = _curves("The autopilot's EKF: test ratios, rejected above 1", "/plots/estimator/**", legend=True)
         left, right = _rows([*sent(), (24, ekf), *_states()]), rrb.Vertical(_log(), _status())
         tabs.append(rrb.Horizontal(left, right, name="Autopilot link"))
-    other = _curves("All other numbers: rates, lags, ages, counts", "/plots/other/**")
-    tabs.append(rrb.Horizontal(other, rrb.Vertical(_log(), _status()), column_shares=[2, 1], name="Timing"))
+    counts = _curves("Pulses and returns", "/plots/count/**", legend=True)
+    other = _curves("Lags of the edges, ages, speeds, counts", ["/plots/other/**", f"{EDGES}/**"], legend=True)
+    numbers = rrb.Vertical(counts, other, row_shares=[1, 3])
+    tabs.append(rrb.Horizontal(numbers, rrb.Vertical(_log(), _status()), column_shares=[2, 1], name="Timing"))
     graph = rrb.TextDocumentView(name="Graph", origin="/about/graph")
     settings = rrb.TextDocumentView(name="Settings", origin="/about/settings")
     tabs.append(rrb.Horizontal(graph, settings, name="Configuration"))
@@ -153,7 +164,7 @@ def _detection(depth_images: bool, candidates: bool) -> rrb.Container:
         rows.append((40, rrb.Horizontal(depth, score)))
     rows.append((36, rrb.TextDocumentView(name="Candidates: reasons", origin="/candidates")))
     if candidates:
-        rows.append((34, _curves("Probability of a drone [%]", "/plots/probability/**")))
+        rows.append((34, _curves("Probability of a drone [%]", "/plots/probability/**", legend=True)))
     rows.append((20, lidar_range))
     return rrb.Horizontal(_scene(candidates), _rows(rows), name="Detection")
 
@@ -173,20 +184,29 @@ def _camera_views(vision: Vision) -> Rows:
         contents = ["/sphere/**", "/frames/**"]
         rows.append((24, _space(name, contents, frame=sphere_frame(CameraMount.VEHICLE), eye=eye, grid_m=None)))
     if vision.rotation:
-        rows.append((13, _curves("Probabilities of yaw branches, and of a yaw within 20 deg [%]", "/plots/branch/**")))
+        rows.append(
+            (
+                13,
+                _curves(
+                    "Yaw [%]: branch 0 deg green, 90 orange, 180 violet, 270 blue, none red; "
+                    "within 20 deg of the best grey",
+                    "/plots/branch/**",
+                ),
+            )
+        )
     if vision.rotation or vision.pose:
         rows += _rotation_views()
     if vision.odometry:
         matches = _curves("Drone odometry: inlier features", "/plots/matches/**")
-        sigma = _curves("Sigma of the motion [deg]", "/plots/motion_sigma/**")
+        sigma = _curves("Sigma of the motion [deg]: rotation grey, direction yellow", "/plots/motion_sigma/**")
         rows.append((11, rrb.Horizontal(matches, sigma)))
     return rows
 
 
 def _rotation_views() -> Rows:
     return [
-        (14, _curves("Rotation of the drone in the vehicle frame [deg]", "/plots/rotation/**")),
-        (12, _curves("Sigma of the rotation [deg]", "/plots/rotation_sigma/**")),
+        (14, _curves("Rotation in the vehicle frame [deg]: roll red, pitch green, yaw blue", "/plots/rotation/**")),
+        (12, _curves("Sigma of the rotation [deg], about x red, y green, z blue", "/plots/rotation_sigma/**")),
     ]
 
 
@@ -212,11 +232,12 @@ def _image(name: str, contents: list[str]) -> rrb.Spatial2DView:
     return rrb.Spatial2DView(name=name, origin="/", contents=contents, background=[0, 0, 0])
 
 
-def _curves(name: str, contents: str) -> rrb.TimeSeriesView:
+def _curves(name: str, contents: str | list[str], *, legend: bool = False) -> rrb.TimeSeriesView:
+    """Curves over the whole run. A legend covers data, so a view has one only if its name cannot list the colours."""
     return rrb.TimeSeriesView(
         name=name,
         origin="/plots",
         contents=contents,
         axis_x=_WHOLE_RUN,
-        plot_legend=rrb.Corner2D.LeftTop,
+        plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=legend),
     )

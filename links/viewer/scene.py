@@ -31,7 +31,6 @@ TURNTABLE_PERIOD_NS = 20_000_000
 HYPOTHESIS_TIMEOUT_NS = 150_000_000  # a tracker reports each hypothesis ten times a second
 STATE_TIMEOUT_NS = 1_000_000_000
 STATE_PRIORITY = (TrackingState.TRACKING, TrackingState.COASTING, TrackingState.CANDIDATE)
-FAN_HALF_OPENING_RAD = np.deg2rad(15.0)  # VLP-16 user manual 63-9243: beams from -15 to +15 deg
 
 
 class LastCandidate(NamedTuple):
@@ -233,7 +232,7 @@ class ViewerScene:
 
 
 def static_entities(mount: LidarMount | None) -> Entities:
-    """Static entities: the vehicle's axes and, with a mount, the LiDAR's frame and the fan of its beams."""
+    """Static entities: the vehicle's axes and, with a mount, the LiDAR's frame."""
     axes = rr.Arrows3D(vectors=np.diag([5.0, 2.5, 2.5]), colors=colours.AXES, radii=rr.Radius.ui_points(2.0))
     yield Entity("vehicle/axes", axes, frame="vehicle")
     labels = ["vehicle", "forward"]
@@ -243,12 +242,15 @@ def static_entities(mount: LidarMount | None) -> Entities:
         return
     lidar = mount.T_turntable_lidar.matrix()
     yield Entity("frames/lidar", _transform(lidar, "turntable", "lidar"))
+
+
+def beam_fan(lowest_rad: float, highest_rad: float) -> Entity:
+    """Circles at the elevations of the lowest and the highest beam."""
     turn = np.linspace(0, 2 * np.pi, 73)
     circle = np.stack([np.sin(turn), np.cos(turn), np.zeros_like(turn)], axis=1)
-    c, s = np.cos(FAN_HALF_OPENING_RAD), np.sin(FAN_HALF_OPENING_RAD)
-    edges = [FAN_RADIUS_M * (c * circle + [0, 0, s * side]) for side in (-1, 1)]
+    edges = [FAN_RADIUS_M * (math.cos(w) * circle + [0, 0, math.sin(w)]) for w in (lowest_rad, highest_rad)]
     fan = rr.LineStrips3D(edges, colors=colours.FAN, radii=rr.Radius.ui_points(1.0))
-    yield Entity("lidar/fan", fan, frame="lidar")
+    return Entity("lidar/fan", fan, frame="lidar")
 
 
 def initial_frames(mount: LidarMount | None) -> Entities:

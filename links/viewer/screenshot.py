@@ -37,10 +37,14 @@ class ViewerMissing(LinkError):
 def show(url_or_file: str | Path) -> subprocess.Popen[bytes]:
     """Open a viewer window on a serving run (`Viewer.url`) or on an .rrd file; it outlives this process.
 
-    Raises ViewerMissing when the window does not open.
+    Raises ViewerMissing when the window does not open, LinkError when there is no such file.
     """
     where = str(url_or_file)
-    target = ["--connect", where] if where.startswith("rerun+") else [where]
+    if where.startswith("rerun+"):
+        target = ["--connect", where]
+    else:
+        _check_file(Path(where))
+        target = [where]
     process = _start([*target, "--port", "auto"], new_session=True)
     try:
         process.wait(WINDOW_S)
@@ -66,8 +70,7 @@ def screenshot(
     `tab`: name of the tab to draw, such as Fusion; None: the first one.
     Raises ViewerMissing when there is no viewer or no graphics driver, LinkError when the viewer cannot load the file.
     """
-    if not rrd.is_file():
-        raise LinkError(f"{rrd}: no such file; `grd run` and `grd replay` write run.rrd into their folder")
+    _check_file(rrd)
     with _headless(rrd, size) as viewer:
         state = _wait_until_loaded(viewer, rrd)
         start, end, kind = _span(state, rrd)
@@ -84,6 +87,11 @@ def screenshot(
         for _ in _other_tabs(viewer):
             errors += _view_errors(viewer)
         return list(dict.fromkeys(errors))
+
+
+def _check_file(rrd: Path) -> None:
+    if not rrd.is_file():
+        raise LinkError(f"{rrd}: no such file; `grd run` and `grd replay` write run.rrd into their folder")
 
 
 def _view_errors(viewer: ViewerClient) -> list[str]:

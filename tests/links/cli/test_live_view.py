@@ -135,10 +135,10 @@ def test_edges_without_losses_are_not_shown():
 
 def test_a_source_has_its_rate_the_age_of_its_newest_record_and_its_status():
     rates = Rates()
-    for now_s, count in ((10.0, 0), (10.5, 50), (11.0, 100), (11.5, 100)):
+    for now_s, count in ((10.0, 0), (10.5, 100), (12.0, 200), (12.5, 200)):
         rates.add(now_s, {"lidar": count})
-    assert rates.texts(11.5, "lidar") == ("100.0", "0.5")
-    assert rates.texts(11.5, "servo") == ("", "")
+    assert rates.texts(12.5, "lidar") == ("100.0", "0.5")
+    assert rates.texts(12.5, "servo") == ("", "")
     report = report_of()
     report.statuses = {"lidar": "its clock has jumped", "recorder": "the disk is full"}
     text = shown(report, terminal=True)

@@ -321,14 +321,14 @@ def test_pulses_are_counted_per_slice_and_not_drawn():
     ((_, stamp_ns, joined),) = ready
     assert stamp_ns == 75 * 1_327_104  # 0.1 s; the packet after it is in the next slice
     entities = drawn(joined, "sweep/swept_pulses")
-    assert set(entities) == {"plots/other/sweep/swept_pulses/pulses", "plots/other/sweep/swept_pulses/empty"}
-    np.testing.assert_allclose(entities["plots/other/sweep/swept_pulses/pulses"].values, [76 * 4])
+    assert set(entities) == {"plots/count/sweep/swept_pulses/pulses", "plots/other/sweep/swept_pulses/empty"}
+    np.testing.assert_allclose(entities["plots/count/sweep/swept_pulses/pulses"].values, [76 * 4])
     np.testing.assert_allclose(entities["plots/other/sweep/swept_pulses/empty"].values, [50.0])
 
 
 def test_a_slice_without_pulses_has_no_share():
     entities = drawn(pulses(0, []), "sweep/swept_pulses")
-    assert set(entities) == {"plots/other/sweep/swept_pulses/pulses"}
+    assert set(entities) == {"plots/count/sweep/swept_pulses/pulses"}
 
 
 def test_the_servo_goal_is_a_stepped_curve_next_to_the_servo_angle():

@@ -106,7 +106,7 @@ def test_a_lost_pose_clears_all_and_a_reset_is_logged():
     lost = pose(state=PoseState.LOST, estimate=None, reason="no drone")
     entities = drawn(lost, NAME, where)
     assert "Clear" in type(entities[f"vehicle/{NAME}"].archetypes[0]).__name__
-    assert f"plots/position/{NAME}" not in entities
+    assert np.isnan(entities[f"plots/position/{NAME}"].values).all()  # the curve is interrupted
     assert document(entities["status"]) == "**fuse:** LOST: no drone"
 
 
@@ -151,7 +151,10 @@ def test_a_graph_that_fuses_without_cameras_shows_the_rotation():
         return set(names(layout(depth_images=False, candidates=True, vision=vision).root_container))
 
     added = shown(Vision(pose=True)) - shown(Vision())
-    assert added == {"Rotation of the drone in the vehicle frame [deg]", "Sigma of the rotation [deg]"}
+    assert added == {
+        "Rotation in the vehicle frame [deg]: roll red, pitch green, yaw blue",
+        "Sigma of the rotation [deg], about x red, y green, z blue",
+    }
 
 
 def test_the_gate_of_the_autopilot_link_has_a_lane_a_log_and_each_value_against_its_limit():
@@ -179,6 +182,16 @@ def test_errors_are_drawn_at_the_times_of_the_estimates_against_the_nearest_dron
     assert [stamp_ns for stamp_ns, _ in found] == [2_000_000_000, 2_020_000_000, 2_040_000_000]
     np.testing.assert_allclose([entity.values[0] for _, entity in found], [0.1, 0.2, 0.3])
     np.testing.assert_allclose(found[0][1].values[1], math.sqrt(0.04 + 0.09 + 0.16))
+
+
+def test_the_curve_of_an_error_is_interrupted_while_the_position_is_unknown():
+    where, later_ns = scene(), 4_000_000_000
+    for stamp_ns in (2_000_000_000, later_ns):
+        drawn(pose(stamp_ns=stamp_ns), NAME, where)
+    stamps_ns = np.array([2_000_000_000, 2_020_000_000, later_ns])
+    found = list(errors_against([(stamps_ns, np.zeros((3, 3)))], where))
+    assert [stamp_ns for stamp_ns, _ in found] == [2_000_000_000, 2_000_000_001, later_ns]
+    assert np.isnan(found[1][1].values).all()
 
 
 def test_the_truth_and_the_errors_are_in_the_file_of_a_replay(tmp_path):

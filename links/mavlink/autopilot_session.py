@@ -21,6 +21,7 @@ PX4 src/modules/mavlink/mavlink_timesync.cpp.
 
 from __future__ import annotations
 
+import dataclasses
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -136,6 +137,8 @@ class AutopilotSession:
 
     def send_pose(self, pose: RelativePose) -> None:
         """Send a pose, or reject it. Never blocks."""
+        if self.poses.sends_yaw:  # the autopilot adopts it: the yaw of its axes is no longer the one that was learnt
+            pose = dataclasses.replace(pose, odom_yaw_rad=None, odom_yaw_sigma_rad=None)
         with self._lock:
             now_ns = self._now_ns()
             self._send_periodic(now_ns)

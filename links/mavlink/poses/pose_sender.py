@@ -85,6 +85,11 @@ class PoseSender:
         self.autopilot = AutopilotEstimate()
 
     @property
+    def sends_yaw(self) -> bool:
+        """Whether the poses contain the yaw."""
+        return self._yaw == "measured"
+
+    @property
     def sending(self) -> bool:
         """Whether poses are being sent."""
         return self._sending

@@ -69,7 +69,6 @@ class FlightStack:
         s = self.settings = settings.flight_stack
         self._autopilot, self._start_ns = settings, start_ns
         self.own, self.px4 = (1, 1), s.kind == "px4"
-        required = required_parameters(s.kind, "none")
         fuses_yaw = any(SOURCE_SETS[name].yaw is AidingSource.EXTERNAL for name in s.source_sets[1:])
         required = required_parameters(s.kind, "measured" if fuses_yaw else "none")
         self.parameters: dict[str, float] = {parameter.name: parameter.best for parameter in required}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import socket
 import threading
 from pathlib import Path
@@ -84,8 +83,11 @@ class Drone:
                     udp.sendto(packed(each, self._mav), ("127.0.0.1", listener.link.port))
                 pause.wait(0.01)
                 if poses:
-                    pose = good_pose(host_time.now_ns(), R_map_drone=rotation_z(0.5))
-                    listener.link.on_pose(dataclasses.replace(pose, odom_yaw_rad=None))
+                    learnt_before_the_switch_rad = -1.0
+                    pose = good_pose(
+                        host_time.now_ns(), R_map_drone=rotation_z(0.5), odom_yaw_rad=learnt_before_the_switch_rad
+                    )
+                    listener.link.on_pose(pose)
         listener.wait(lambda: len(listener.messages) >= before + 2 * count)
 
 

@@ -12,6 +12,7 @@ from links.simulated.autopilot.flight_stack.outcome import FlightOutcome
 from links.simulated.sensors.vehicle_odometry import VehicleOdometry, VehicleOdometrySettings
 from links.simulated.world.mesh import RayScene, box
 from links.simulated.world.scene import Truth
+from stages.geometry.frames import rotation_z
 from tests.links.simulated.autopilot.flight_stack.sent_truth import PARKED, START_NS, Host
 
 
@@ -71,6 +72,25 @@ def test_the_share_inside_is_that_of_the_covariance_in_the_message(
     sent(host, outcome, shift_m, yaw_deg)
     result = outcome.result()
     assert (result.inside_share, result.yaw_inside_share) == inside
+
+
+def test_a_position_without_yaw_is_compared_in_north_aligned_axes() -> None:
+    host = Host(3.0)
+    outcome = watched(host)
+    host.run(2.0)
+    north_yaw = host.stack.north_yaw_of_map
+    assert abs(math.sin(north_yaw)) > 0.1, "otherwise the test shows nothing"
+
+    def change(message, time_s: float) -> None:
+        x_north, y_west, _ = rotation_z(north_yaw) @ [message.x, -message.y, 0.0]
+        message.x, message.y, message.q = float(x_north), float(-y_west), [math.nan] * 4
+
+    host.edit = change
+    now_ns = START_NS + host.ticks * 10_000_000
+    outcome.on_sent(Record("/autopilot/tx", now_ns, now_ns, bytes(host.pose(now_ns).pack(host._mav))))
+    result = outcome.result()
+    assert result.sent_worst_m == pytest.approx(0.0, abs=0.2)
+    assert result.sent_yaw_rms_deg is None
 
 
 def test_the_longest_gap_lasts_from_one_pose_to_the_next_or_to_the_end() -> None:

@@ -5,8 +5,8 @@ else reads its DroneMotion. The mean over an interval is that of its two samples
 was set back, end a segment. Specific force, rate and the vertical are the drone's own measurements; the autopilot's
 position, velocity and yaw are added only while they cannot contain a pose that grd sent (`independent`).
 
-With a sample noise s, the noise density of an interval of dt is s sqrt(dt): integrated over many intervals, each sample
-counts once with dt, so that the variance of the velocity grows by s^2 dt per second.
+The noise is a density, estimated from the samples (imu_noise.py): with a density d the variance of the velocity grows
+by d^2 per second. Until it is known, samples with white noise s at intervals of dt have the density s sqrt(dt).
 
 Source: ours; P V.B, V.E. Initial noise: ArduPilot EK3_ACC_P_NSE 0.35 m/s^2 and EK3_GYRO_P_NSE 0.015 rad/s; least noise:
 MPU-6000 product specification 3.4, 6.1 and 6.2 (400 ug/sqrt(Hz), 0.005 deg/s/sqrt(Hz)).
@@ -24,7 +24,7 @@ from pydantic import Field
 from flow.stage import Settings, Stage
 from stages.messages import DroneAttitude, DroneImu, DroneLocalPosition, DroneMotion, DroneOdometry, DroneTilt
 from stages.odometry.drone.autopilot_estimate import AutopilotEstimate
-from stages.odometry.drone.imu_noise import SampleNoise
+from stages.odometry.drone.imu_noise import NoiseDensity
 
 CLOCK_SET_NS = 1_000_000_000  # a stamp that is earlier by more: the clock was set; by less: late or repeated
 
@@ -33,7 +33,7 @@ class InertialMotionSettings(Settings):
     """Settings of `InertialMotion`."""
 
     longest_gap_s: float = Field(0.25, gt=0, le=1)  # between two samples of a segment; 10 Hz with one sample lost
-    noise_window_s: float = Field(0.22, gt=0, le=2)  # of the local fit
+    noise_window_s: float = Field(0.4, gt=0, le=2)  # of the local fit
     noise_average_s: float = Field(2.0, gt=0, le=60)
     initial_force_mps2: float = Field(0.35, gt=0)  # noise of a sample, until it is estimated
     initial_rate_radps: float = Field(0.015, gt=0)
@@ -50,7 +50,7 @@ class InertialMotion(Stage[InertialMotionSettings]):
     def __init__(self, settings: InertialMotionSettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
         self._autopilot = AutopilotEstimate(self.settings.autopilot_age_s)
-        self._noise = SampleNoise(self.settings.noise_window_s, self.settings.noise_average_s)
+        self._noise = NoiseDensity(self.settings.noise_window_s, self.settings.noise_average_s)
         self._last: DroneImu | None = None
         self._segment = 0
         self._counts: Counter[str] = Counter()
@@ -114,7 +114,7 @@ class InertialMotion(Stage[InertialMotionSettings]):
         self._last = imu
 
     def _noise_densities(self, dt_s: float) -> tuple[float, float]:
-        """White-noise densities of specific force and rate over an interval."""
+        """Noise densities of specific force and rate over an interval."""
         s, root = self.settings, math.sqrt(dt_s)
-        force, rate = self._noise.sigma or (s.initial_force_mps2, s.initial_rate_radps)
-        return max(force * root, s.least_force_noise), max(rate * root, s.least_rate_noise)
+        force, rate = self._noise.density or (s.initial_force_mps2 * root, s.initial_rate_radps * root)
+        return max(force, s.least_force_noise), max(rate, s.least_rate_noise)

@@ -1,9 +1,10 @@
 """Motion of the drone over each interval between two IMU samples, with the noise of the samples.
 
 The one stage that reads the drone's motion from its autopilot: gaps, restarts and resets are resolved here, everybody
-else reads its DroneMotion. The mean over an interval is that of its two samples (trapezoid). A gap, and a clock that
-was set back, end a segment. Specific force, rate and the vertical are the drone's own measurements; the autopilot's
-position, velocity and yaw are added only while they cannot contain a pose that grd sent (`independent`).
+else reads its DroneMotion. The mean over an interval is that of its two samples (trapezoid). A single false sample is
+left out (imu_outliers.py). A gap, and a clock that was set back, end a segment. Specific force, rate and the vertical
+are the drone's own measurements; the autopilot's position, velocity and yaw are added only while they cannot contain a
+pose that grd sent (`independent`).
 
 The noise is a density, estimated from the samples (imu_noise.py): with a density d the variance of the velocity grows
 by d^2 per second. Until it is known, samples with white noise s at intervals of dt have the density s sqrt(dt).
@@ -25,6 +26,7 @@ from flow.stage import Settings, Stage
 from stages.messages import DroneAttitude, DroneImu, DroneLocalPosition, DroneMotion, DroneOdometry, DroneTilt
 from stages.odometry.drone.autopilot_estimate import AutopilotEstimate
 from stages.odometry.drone.imu_noise import NoiseDensity
+from stages.odometry.drone.imu_outliers import FalseSamples
 
 CLOCK_SET_NS = 1_000_000_000  # a stamp that is earlier by more: the clock was set; by less: late or repeated
 
@@ -51,6 +53,7 @@ class InertialMotion(Stage[InertialMotionSettings]):
         super().__init__(settings, **values)
         self._autopilot = AutopilotEstimate(self.settings.autopilot_age_s)
         self._noise = NoiseDensity(self.settings.noise_window_s, self.settings.noise_average_s)
+        self._false = FalseSamples()
         self._last: DroneImu | None = None
         self._segment = 0
         self._counts: Counter[str] = Counter()
@@ -88,6 +91,9 @@ class InertialMotion(Stage[InertialMotionSettings]):
         if not 0 < dt_ns <= 1e9 * self.settings.longest_gap_s:
             self._segment += 1
             return self._begin(imu)
+        if self._is_false(imu):
+            self._counts["false samples"] += 1
+            return None
         force = 0.5 * (last.acceleration_drone_mps2 + imu.acceleration_drone_mps2)
         rate = 0.5 * (last.angular_velocity_drone_radps + imu.angular_velocity_drone_radps)
         self._add(imu)
@@ -107,7 +113,12 @@ class InertialMotion(Stage[InertialMotionSettings]):
 
     def _begin(self, imu: DroneImu) -> None:
         self._noise.new_segment()
+        self._false.new_segment()
+        self._is_false(imu)
         self._add(imu)
+
+    def _is_false(self, imu: DroneImu) -> bool:
+        return self._false.add(imu.stamp_ns, imu.acceleration_drone_mps2, imu.angular_velocity_drone_radps)
 
     def _add(self, imu: DroneImu) -> None:
         self._noise.add(imu.stamp_ns, imu.acceleration_drone_mps2, imu.angular_velocity_drone_radps)

@@ -16,9 +16,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy.io
+from scipy.interpolate import CubicSpline
 
 from flow.message import Message
-from stages.geometry.frames import rotation_z
+from links.simulated.autopilot.flight_stack.quadrotor import Quadrotor
+from links.simulated.autopilot.flight_stack.settings import FlightStackSettings
+from stages.geometry.frames import rotation_from_quaternion_xyzw, rotation_z
+from stages.kernels.geometry.so3 import exp_rotation
 from stages.messages import (
     DroneAttitude,
     DroneFix,
@@ -31,7 +36,7 @@ from stages.messages import (
 )
 from stages.odometry.drone import IndependentTelemetry, InertialMotion
 from tests.stages.fuse.imu_flights import FIRST_FIX_S, gauss_markov, ns
-from tests.stages.fuse.pixhawk_log import PixhawkLog, pixhawk_log, reference
+from tests.stages.fuse.pixhawk_log import LOG, PixhawkLog, pixhawk_log, reference
 
 LATE_S = 0.03  # of telemetry
 TELEMETRY_PORTS = {DroneImu: "imu", DroneAttitude: "attitude", DroneLocalPosition: "position"}
@@ -148,28 +153,102 @@ class PixhawkFlight(RealFlight):
         i = int(np.searchsorted(self._truth.time_s, at))
         return slice(max(i - 1, 0), i + 1)
 
-    def attitude_yaw_rad(self, t: float) -> float:
-        """Yaw of the drone in map by the autopilot's attitude, its compass included."""
-        times, R = self.log.attitude
-        R_map_drone = self.R_map_odom @ R[int(np.argmin(np.abs(times - self.start_s - t)))]
-        return float(np.arctan2(R_map_drone[1, 0] - R_map_drone[0, 1], R_map_drone[0, 0] + R_map_drone[1, 1]))
-
     def telemetry(self) -> Iterator[tuple[float, Message]]:
         """(arrival [s], message): IMU and attitude; while independent also the position."""
         for stamp, rate, force in zip(*self.log.imu[self.imu], strict=True):
             t = stamp - self.start_s
             if 0 <= t < self.until_s + 0.3:
                 force = np.round(force / 9.80665e-3) * 9.80665e-3  # RAW_IMU: whole mg and mrad/s
-                yield t + LATE_S, DroneImu(stamp_ns=ns(t), acceleration_drone_mps2=force, angular_velocity_drone_radps=rate.round(3))
+                yield (
+                    t + LATE_S,
+                    DroneImu(stamp_ns=ns(t), acceleration_drone_mps2=force, angular_velocity_drone_radps=rate.round(3)),
+                )
         times, rotations = self.log.attitude
         stamps, rates, _ = self.log.imu[self.imu]
         for stamp, R in zip(times, rotations, strict=True):
             t = stamp - self.start_s
             if 0 <= t < self.until_s + 0.3:
                 rate = rates[int(np.argmin(np.abs(stamps - stamp)))]
-                attitude = DroneAttitude(stamp_ns=ns(t), R_odom_drone=R, angular_velocity_drone_radps=rate, independent=self.independent)
+                attitude = DroneAttitude(
+                    stamp_ns=ns(t), R_odom_drone=R, angular_velocity_drone_radps=rate, independent=self.independent
+                )
                 yield t + LATE_S, attitude
         for stamp, xyz, v in zip(*self.log.position, strict=True) if self.independent else ():
             t = stamp - self.start_s
             if 0 <= t < self.until_s + 0.3:
-                yield t + LATE_S, DroneLocalPosition(stamp_ns=ns(t), xyz_odom_m=xyz, velocity_odom_mps=v, independent=True)
+                yield (
+                    t + LATE_S,
+                    DroneLocalPosition(stamp_ns=ns(t), xyz_odom_m=xyz, velocity_odom_mps=v, independent=True),
+                )
+
+
+TRACKS = LOG.parents[1] / "drone_traj"
+RTK_HZ = 5.0  # the RTK files have no times: at 10 Hz the drone would accelerate by 26 m/s^2
+FOLLOWED_PER_S, DAMPED_PER_S = 1.5, 2.5  # gains of the controller that follows the track
+
+
+def tracks() -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Time [s] and position (n, 3) [m] of each track while it flies, at its real times."""
+    polar = TRACKS / "eth_tps_20210104"
+    stamp = scipy.io.loadmat(polar / "meas_ts_20210104111312.mat")["meas_ts"][:, 0] * 86400.0
+    xyz = scipy.io.loadmat(polar / "meas_cart_20210104111312.mat")["meas_cart"]
+    flying = (stamp - stamp[0] > 75.0) & (stamp - stamp[0] < 335.0)
+    out = {"total station": (stamp[flying] - stamp[0], xyz[flying])}
+    for name in ("eth_ds1_rtk", "eth_ds3_rtk"):
+        rtk = np.loadtxt(TRACKS / name / "trajectory" / "rtk.txt")
+        out[name] = np.arange(len(rtk)) / RTK_HZ, rtk
+    return out
+
+
+@dataclass
+class TrackFlight(RealFlight):
+    """A part of a track, flown by the simulator's airframe in gusts of 0.5 m/s; IMU with bias and rotor vibration."""
+
+    track: str = "total station"
+    vibration_mps2: float = 0.3
+
+    @staticmethod
+    def span_s(track: str) -> tuple[float, float]:
+        """First and last start of a window of 60 s."""
+        times, xyz = tracks()[track]
+        moves = np.flatnonzero(np.linalg.norm(xyz - xyz[0], axis=1) > 3.0)
+        ends = np.flatnonzero(np.linalg.norm(xyz - xyz[-1], axis=1) > 3.0)
+        return float(times[moves[0]]), float(times[ends[-1]] - 61.0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        times, xyz = tracks()[self.track]
+        knots = np.arange(times[0], times[-1], 0.5)  # means over 0.5 s: outliers and noise of single points
+        centres = [np.median(xyz[(times >= t) & (times < t + 0.5)], axis=0) for t in knots]
+        known = np.array([np.isfinite(c).all() for c in centres])
+        path = CubicSpline(knots[known] + 0.25, np.array(centres)[known])
+        stack = FlightStackSettings.model_validate({"imu": {"vibration_mps2": self.vibration_mps2}})
+        first, yaw = path(self.start_s), float(self.rng.uniform(0, 2 * np.pi))
+        drone = Quadrotor(stack, first, yaw, float(first[2]) - 100.0, self.until_s + 1.0, self.seed)
+        ticks, estimate, self._samples = round(100 * (self.until_s + 0.6)), np.zeros(16), []
+        drone.state[3:6] = path(self.start_s, 1)
+        for k in range(ticks):
+            at = self.start_s + 0.01 * k
+            estimate[:10] = drone.state[:10]
+            wanted = path(at, 2) + FOLLOWED_PER_S**2 * (path(at) - drone.state[0:3])
+            wanted = wanted + DAMPED_PER_S * (path(at, 1) - drone.state[3:6]) + np.array([0.0, 0.0, 9.80665])
+            command = np.array([*wanted, yaw + 0.5 * np.sin(0.1 * k * 0.06), 0.0, 1.0])
+            self._samples.append(drone.fly(estimate, command).samples[-1])
+        self._states = drone.motion.states
+
+    def truth(self, t: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """R_map_drone, position and velocity in map; 400 Hz."""
+        state, turn = self._states[round(400 * t)], self.R_map_odom
+        R = rotation_from_quaternion_xyzw(tuple(state[6:10]))
+        return turn @ R, turn @ state[0:3], turn @ state[3:6]
+
+    def telemetry(self) -> Iterator[tuple[float, Message]]:
+        """(arrival [s], message): IMU at 50 Hz, attitude at 10 Hz with a tilt error of 2 deg."""
+        tilt = gauss_markov(self.rng, np.radians(2.0) / np.sqrt(2), 15.0, 0.1, 10 * round(self.until_s + 1), 2)
+        for k in range(2, len(self._samples), 2):
+            t, sample = 0.01 * k, self._samples[k - 1]  # the last of four steps, at the end of its tick
+            force, rate = np.round(sample[3:] / 9.80665e-3) * 9.80665e-3, sample[:3].round(3)
+            yield t + LATE_S, DroneImu(stamp_ns=ns(t), acceleration_drone_mps2=force, angular_velocity_drone_radps=rate)
+            if k % 10 == 0:
+                R = self.R_map_odom.T @ self.truth(t)[0] @ exp_rotation(np.array([*tilt[k // 10], 0.0]))
+                yield t + LATE_S, DroneAttitude(stamp_ns=ns(t), R_odom_drone=R, angular_velocity_drone_radps=rate)

@@ -218,10 +218,9 @@ class TrackFlight(RealFlight):
     def __post_init__(self) -> None:
         super().__post_init__()
         times, xyz = tracks()[self.track]
-        knots = np.arange(times[0], times[-1], 0.5)  # means over 0.5 s: outliers and noise of single points
-        centres = [np.median(xyz[(times >= t) & (times < t + 0.5)], axis=0) for t in knots]
-        known = np.array([np.isfinite(c).all() for c in centres])
-        path = CubicSpline(knots[known] + 0.25, np.array(centres)[known])
+        bins = [times[(times >= t) & (times < t + 0.5)] for t in np.arange(times[0], times[-1], 0.5)]
+        full = [b for b in bins if len(b)]  # medians over 0.5 s: outliers and noise of single points
+        path = CubicSpline([b.mean() for b in full], [np.median(xyz[np.isin(times, b)], axis=0) for b in full])
         stack = FlightStackSettings.model_validate({"imu": {"vibration_mps2": self.vibration_mps2}})
         first, yaw = path(self.start_s), float(self.rng.uniform(0, 2 * np.pi))
         drone = Quadrotor(stack, first, yaw, float(first[2]) - 100.0, self.until_s + 1.0, self.seed)
@@ -232,7 +231,7 @@ class TrackFlight(RealFlight):
             estimate[:10] = drone.state[:10]
             wanted = path(at, 2) + FOLLOWED_PER_S**2 * (path(at) - drone.state[0:3])
             wanted = wanted + DAMPED_PER_S * (path(at, 1) - drone.state[3:6]) + np.array([0.0, 0.0, 9.80665])
-            command = np.array([*wanted, yaw + 0.5 * np.sin(0.1 * k * 0.06), 0.0, 1.0])
+            command = np.array([*wanted, yaw + 0.5 * np.sin(0.006 * k), 0.0, 1.0])
             self._samples.append(drone.fly(estimate, command).samples[-1])
         self._states = drone.motion.states
 

@@ -21,6 +21,7 @@ from stages.heading.imu_buffer import ImuBuffer
 from stages.heading.inertial_bank import NEAR_RAD, InertialBank, YawMixture, start
 from stages.heading.inertial_state import POSITION, ImuIntervals, InertialState
 from stages.heading.odometry_heading import YawEvidence
+from stages.heading.rotation_answers import Answers, add_answers
 from stages.kernels.geometry.so3 import log_rotation
 from stages.messages import VisualMotion
 
@@ -104,16 +105,11 @@ class InertialHeading:
         if self.bank is not None:
             measure.add_vertical(self.bank, up_drone, sigma_rad)
 
-    def add_rotation(
-        self, stamp_ns: int, R_map_drone: Array64, R_map_vehicle: Array64, covariance_rad2: Array64
-    ) -> float | None:
-        """Add a rotation by vanishing points; returns the probability that it is no outlier, or None: too old."""
-        late_s = self._late_s(stamp_ns)
-        if self.bank is None or late_s is None:
+    def add_rotation(self, stamp_ns: int, answers: Answers, share: float) -> float | None:
+        """Add rotations by cameras, of which `share` is new evidence. Returns P that one is right; None: too old."""
+        if self.bank is None or self._late_s(stamp_ns) is None:
             return None
-        dR, variance = self.turn(stamp_ns, self.stamp_ns)
-        covariance = dR.T @ covariance_rad2 @ dR + variance * np.eye(3)
-        return measure.add_rotation(self.bank, R_map_drone @ dR, R_map_vehicle, covariance)
+        return add_answers(self.bank, answers.turned(*self.turn(stamp_ns, self.stamp_ns)), share)
 
     def add_visual_motion(self, motion: VisualMotion) -> None:
         """Add a step of the drone's visual odometry that ended at the bank's time or shortly before."""

@@ -122,7 +122,7 @@ class JointAlign(Stage[JointAlignSettings]):
             covariances_rad2=np.array([one.covariance_rad2(0) + variance_rad2 * np.eye(3) for one, _ in found]),
             probabilities=np.array([p for _, p in found]),
             branch_probability=np.full(4, probability / 4),
-            state=BranchState.AMBIGUOUS,
+            state=BranchState.OPEN,
             switches=0,
             reason=f"{lines}: {probability:.0%}{others}",
         )

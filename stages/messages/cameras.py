@@ -45,6 +45,7 @@ class BranchState(enum.Enum):
     NONE = 0  # no rotation available
     AMBIGUOUS = 1  # known up to multiples of 90 deg, or of 180 deg
     RESOLVED = 2
+    OPEN = 3  # known up to multiples of 90 deg; the stage leaves the branch to the heading
 
 
 @message(schema=91)

@@ -75,5 +75,5 @@ class SimulatedRotations(Source[SimulatedRotationsSettings]):
         """One rotation."""
         content = json.loads(record.data)
         R, covariance = nearest_rotation(np.array(content["R"])), content["sigma_rad"] ** 2 * np.eye(3)
-        open_branch, state = np.full(4, 0.25), BranchState.AMBIGUOUS
+        open_branch, state = np.full(4, 0.25), BranchState.OPEN
         return RelativeRotation.one(record.stamp_ns, R, covariance, open_branch, state, 0, "simulated rotation")

@@ -115,7 +115,7 @@ def test_lidar_positions_of_another_object_end_in_a_state_that_sends_nothing():
             if hasattr(made, "state"):
                 states[round(seconds(made.stamp_ns), 2)] = made
     assert states[7.5].state is PoseState.FULL
-    late = [p for t, p in states.items() if t > 12.0]
+    late = [p for t, p in states.items() if t > 12.5]
     assert not any(isinstance(p.estimate, PoseEstimate) for p in late)
     assert {p.state for p in late} == {PoseState.LOST}
 

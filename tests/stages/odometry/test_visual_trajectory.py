@@ -1,16 +1,13 @@
-"""Rotations and displacements of the drone: interpolation, extrapolation, jumps, and images alone."""
+"""Rotation of the drone between two times by its images: chained, interpolated, extrapolated."""
 
 from __future__ import annotations
-
-import math
 
 import numpy as np
 import pytest
 
-from stages.geometry.frames import rotation_z
 from stages.kernels.geometry.so3 import exp_rotation
 from stages.messages import VisualMotion
-from stages.odometry.drone.trajectory import AutopilotTrajectory, VisualTrajectory, rotation_between
+from stages.odometry.drone.visual_trajectory import VisualTrajectory
 
 MS = 1_000_000
 RATE = np.array([0.1, -0.3, 1.5])
@@ -36,7 +33,7 @@ def test_images_with_a_long_gap_give_the_whole_rotation_but_no_interpolation():
     assert images.at(1400 * MS) is None
     assert images.at(400 * MS) is not None
     assert images.at(2400 * MS) is not None
-    assert rotation_between(AutopilotTrajectory(), images, 300 * MS, 2500 * MS).measured
+    assert images.between(300 * MS, 2500 * MS) is not None
 
 
 def test_consecutive_visual_motions_are_chained():
@@ -62,9 +59,13 @@ def test_a_gap_between_steps_begins_a_new_chain():
     images = VisualTrajectory()
     images.add(step(0, 100))
     images.add(step(300, 400))
-    turn = rotation_between(AutopilotTrajectory(), images, 50 * MS, 350 * MS)
-    assert not turn.measured
-    np.testing.assert_array_equal(turn.R_from_to, np.eye(3))
-    assert math.degrees(math.sqrt(turn.variance_rad2)) == pytest.approx(12.0)  # 40 deg/s for 0.3 s
+    assert images.between(50 * MS, 350 * MS) is None
 
 
+def test_the_rotation_between_two_times_is_that_of_the_images_in_both_directions():
+    images = VisualTrajectory()
+    images.add(step(0, 500))
+    there, back = images.between(100 * MS, 400 * MS), images.between(400 * MS, 100 * MS)
+    assert there is not None and back is not None
+    np.testing.assert_allclose(there.R_from_to, exp_rotation(0.3 * RATE), atol=1e-9)
+    np.testing.assert_allclose(back.R_from_to, exp_rotation(0.3 * RATE).T, atol=1e-9)

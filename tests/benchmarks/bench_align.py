@@ -72,7 +72,6 @@ def test_refinement(benchmark, name):
     benchmark(refine, *lines, street_directions(a, b, yaw), yaw, ALLOWED)
 
 
-
 @pytest.mark.parametrize("answers", [1, 3])
 def test_the_answers_of_a_pair_in_the_bank(benchmark, answers):
     yaws = np.radians([10.0, 45.0, 70.0])[:answers]

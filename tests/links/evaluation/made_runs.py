@@ -142,7 +142,15 @@ def yaw_quaternion(yaw_rad) -> np.ndarray:
 
 
 def add_rotations(
-    folder: Path, t_s, quaternions, *, variance_rad2=(1e-4, 1e-4, 1e-4), accepted=True, resolved=False, switches=0, undecided="AMBIGUOUS"
+    folder: Path,
+    t_s,
+    quaternions,
+    *,
+    variance_rad2=(1e-4, 1e-4, 1e-4),
+    accepted=True,
+    resolved=False,
+    switches=0,
+    undecided="AMBIGUOUS",
 ) -> Path:
     """Add the rotation by both cameras at `t_s`, with a covariance along the drone's axes."""
     n = len(t_s)

@@ -66,6 +66,7 @@ def test_the_rotation_between_two_times_is_that_of_the_images_in_both_directions
     images = VisualTrajectory()
     images.add(step(0, 500))
     there, back = images.between(100 * MS, 400 * MS), images.between(400 * MS, 100 * MS)
-    assert there is not None and back is not None
+    assert there is not None
+    assert back is not None
     np.testing.assert_allclose(there.R_from_to, exp_rotation(0.3 * RATE), atol=1e-9)
     np.testing.assert_allclose(back.R_from_to, exp_rotation(0.3 * RATE).T, atol=1e-9)

@@ -59,6 +59,7 @@ class Estimator:
         self.fix_ns: int | None = None  # newest LiDAR position used
         self.newest_fix_ns: int | None = None  # also when the drone is lost
         self.rotation_ns: int | None = None  # newest rotation by vanishing points used
+        self._cameras_confirmed = False  # the graph was started with confirmed answers of both cameras
         self.nis = math.nan
         self.bias_covariance_m2 = np.zeros((3, 3))
         self.rotation_bias_rad2 = np.zeros((3, 3))
@@ -185,7 +186,7 @@ class Estimator:
             self.rotation_ns = None
 
     def _to_bank(self) -> None:
-        """The IMU has ended: go on with the bank, from the graph's state."""
+        """Go on with the bank, from the graph's state: the IMU has ended, or cameras give their first answers."""
         self.heading.resume(self.graph.stamp_ns, self.graph.state)
         self.graph.stop()
 
@@ -254,7 +255,8 @@ class Estimator:
         self._add_vertical(self.heading.stamp_ns)
         self._add_ownership(stamp_ns, z, noise, self.heading.add_position(z, noise))
         self.heading.decide(self.is_own)
-        if self.decided and self.imu.is_current(stamp_ns):
+        if self.decided and self.imu.is_current(stamp_ns) and not self.heading.cameras_open:
+            self._cameras_confirmed = self.heading.cameras_confirmed
             self.graph.start(self.heading.stamp_ns, self.heading.decision())
             if self.graph.running:
                 self.heading.stop()
@@ -313,6 +315,8 @@ class Estimator:
         white = (1.0 - bias_share) * rotation.covariances_rad2
         answers = Answers(R_map_vehicle @ rotation.answers, white, rotation.probabilities, R_map_vehicle)
         factor = self._rotation_inflation.factor(stamp_ns)
+        if self.graph.running and not self._cameras_confirmed:
+            self._to_bank()
         if not self.graph.running:
             self.heading.advance(stamp_ns)
             used = (self.heading.add_rotation(stamp_ns, answers, 1.0 / factor) or 0.0) > 0.5

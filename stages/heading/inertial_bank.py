@@ -80,6 +80,7 @@ class InertialBank:
 
     def __init__(self, state: InertialState, log_weight: Array64) -> None:
         self.state, self.log_weight = state, log_weight - _log_sum(log_weight)
+        self.tied = np.zeros(len(state), dtype=np.bool_)  # to an answer of both cameras (rotation_answers.py)
         self.log_evidence = 0.0  # log density of the newest measurement, outliers included
 
     @property
@@ -115,16 +116,16 @@ class InertialBank:
         self.log_weight = log_weight - self.log_evidence
         return float(self.weight @ beta)
 
-    def replace(self, state: InertialState, log_weight: Array64) -> None:
+    def replace(self, state: InertialState, log_weight: Array64, tied: NDArray[np.bool_]) -> None:
         """Other hypotheses, with log weights (n,) that need not be normalised."""
-        self.state, self.log_weight = state, log_weight - _log_sum(log_weight)
+        self.state, self.log_weight, self.tied = state, log_weight - _log_sum(log_weight), tied
         self.tidy()
 
     def tidy(self) -> None:
         """Drop improbable hypotheses, split wide ones and merge those that agree."""
         keep = np.flatnonzero(self.log_weight > self.log_weight.max() + math.log(DROPPED))
         if len(keep) < len(self.log_weight):
-            self.state, self.log_weight = self.state.rows(keep), self.log_weight[keep]
+            self.state, self.log_weight, self.tied = self.state.rows(keep), self.log_weight[keep], self.tied[keep]
             self.log_weight -= _log_sum(self.log_weight)
         wide = np.sqrt(self.state.yaw_variance_rad2) > WIDEST_YAW_RAD
         if wide.any():
@@ -146,6 +147,7 @@ class InertialBank:
         rest = np.setdiff1d(np.arange(len(self.log_weight)), wide)
         self.state = joined([self.state.rows(rest), *parts])
         self.log_weight = np.concatenate([self.log_weight[rest], *(log_weight + share for share in shares)])
+        self.tied = np.concatenate([self.tied[rest], *[self.tied[wide]] * 3])
 
     def _merge_nearest(self) -> bool:
         """Merge the two hypotheses that lose least by it, if they agree or there are too many."""
@@ -157,9 +159,9 @@ class InertialBank:
         a = weight[:, None] / (weight[:, None] + weight[None, :])
         merged2 = a * variance[:, None] + (1 - a) * variance[None, :] + a * (1 - a) * apart**2
         cost = 0.5 * (np.log(merged2) - a * np.log(variance[:, None]) - (1 - a) * np.log(variance[None, :]))
-        cost[np.tril_indices(n)] = math.inf
+        cost[np.tril_indices(n)] = cost[self.tied[:, None] != self.tied] = math.inf
         merged = cost < LOSS if n > STARTS else (cost < 0.1 * LOSS) | ((apart < ALIKE_RAD) & (cost < LOSS))
-        if n <= MOST and not merged.any():
+        if not np.isfinite(cost).any() or (n <= MOST and not merged.any()):
             return False
         i, j = np.unravel_index(int(np.argmin(np.where(merged, cost, cost + 1e6))), cost.shape)
         pair = np.array([i, j])
@@ -169,6 +171,7 @@ class InertialBank:
         log_weight = _log_sum(self.log_weight[pair])
         self.state = joined([self.state.rows(rest), one])
         self.log_weight = np.append(self.log_weight[rest], log_weight)
+        self.tied = np.append(self.tied[rest], self.tied[i])
         return True
 
     @property

@@ -4,10 +4,13 @@
     l_j = p_j / 4 N(up . r_j; 0, up . S_j up)         likelihood of the yaw, if the tilt agrees
     l_0 = (1 - sum p) / (2 pi)                        no answer is right: any yaw
 
-A hypothesis of the bank is split: one for each plausible answer, and one for none. Images of the same streets repeat
-the same wrong answers, so an image is new evidence only with a share f, and otherwise repeats what is known:
+The bank has hypotheses of two kinds. Those that are *tied* follow the answers; the free ones are for the case that the
+answers are wrong, and use no image. The first image splits each free hypothesis: one for each plausible answer, which is
+tied, and itself, with the probabilities above. Lines of the same streets give the same wrong answers image after image,
+however long, so later images move and weigh the tied hypotheses only among themselves: the odds of tied against free
+change by the drone's motion alone. Of a later image a share f is new evidence, the rest repeats what is known:
 
-    w <- (1 - f) w + f w l / sum(w l)
+    w <- (1 - f) w + f w l / sum(w l)                 of the tied hypotheses
 
 Once the heading is decided, the answers are combined into one rotation whose covariance includes their spread (PDA).
 
@@ -27,7 +30,9 @@ from stages.heading.inertial_bank import DROPPED, InertialBank, joined
 from stages.heading.inertial_state import THETA, InertialState, exp_rotations, log_rotations
 
 QUARTERS = np.array([rotation_z(0.5 * math.pi * k) for k in range(4)])
-LEAST_SHARE = 1e-3  # of a hypothesis, for an answer that is less plausible
+LEAST_SHARE = 1e-3  # of a hypothesis: a less plausible answer is ignored
+TINY = 1e-300
+LEAST_WRONG = 0.05  # probability that all answers of a street are wrong, at least
 
 
 @dataclass(frozen=True)
@@ -76,31 +81,48 @@ def _associate(state: InertialState, answers: Answers) -> _Association:
     log_p = np.log(np.maximum(np.repeat(answers.probability, 4) / 4, 1e-12))
     log_likelihood = log_p - 0.5 * (of_yaw + np.log(2 * math.pi * variance))
     log_likelihood = np.where(squared - of_yaw < CHI2_999_2, log_likelihood, -np.inf)
-    none = max(1.0 - float(answers.probability.sum()), 1e-6)
+    none = max(1.0 - float(answers.probability.sum()), LEAST_WRONG)
     return _Association(off, S, squared, log_likelihood, math.log(none / (2 * math.pi)), C)
 
 
 def add_answers(bank: InertialBank, answers: Answers, share: float) -> float:
-    """Add the answers to the bank; `share`: how much of them is new evidence. Returns P that one of them is right."""
-    state, found = bank.state, _associate(bank.state, answers)
+    """Add the answers to the bank; `share`: how much of them is new evidence, if there are tied hypotheses.
+
+    Returns the probability that one of them is right, given that the tied hypotheses are.
+    """
+    first = not bank.tied.any()
+    rows = np.arange(len(bank.tied)) if first else np.flatnonzero(bank.tied)
+    others = np.flatnonzero(~bank.tied) if not first else rows[:0]
+    share = 1.0 if first else share
+    state, log_weight = bank.state.rows(rows), bank.log_weight[rows]
+    found = _associate(state, answers)
     right, total = found.shares()
-    log_all = bank.log_weight + total
-    log_all = log_all - np.logaddexp.reduce(log_all)  # of the hypotheses after the image
+    log_sum = np.logaddexp.reduce(log_weight)
+    log_all = log_weight + total
+    log_all = log_all - np.logaddexp.reduce(log_all) + log_sum  # after the image
     none = np.maximum(1.0 - right.sum(axis=1), 0.0)
-    kept = np.log(np.maximum((1.0 - share) * bank.weight + share * np.exp(log_all) * none, 1e-300))
-    new = math.log(share) + log_all[:, None] + np.log(np.maximum(right, 1e-300))
-    which, answer = np.nonzero((right > LEAST_SHARE) & (new > new.max() + math.log(DROPPED)))
+    kept = np.log(np.maximum((1.0 - share) * np.exp(log_weight) + share * np.exp(log_all) * none, TINY))
+    new = math.log(share) + log_all[:, None] + np.log(np.maximum(right, TINY))
+    which, answer = np.nonzero((right > LEAST_SHARE) & (new > math.log(DROPPED)))
+    probability = float(np.exp(log_all - log_sum) @ right.sum(axis=1))
     if len(which):
-        S, residual = found.S[which, answer], found.residual[which, answer]
-        prior = state.rows(which)
-        PHt = prior.covariance[:, :, THETA]
-        K = np.swapaxes(np.linalg.solve(S, np.swapaxes(PHt, 1, 2)), 1, 2)
-        after = prior.covariance - K @ np.swapaxes(PHt, 1, 2)
-        after = 0.5 * (after + np.swapaxes(after, 1, 2))
-        step = np.einsum("nij,nj->ni", K, residual)
-        moved = InertialState(prior.R, prior.xyz_m, prior.velocity_mps, prior.bias, after).moved(step)
-        bank.replace(joined([state, moved]), np.concatenate([kept, new[which, answer]]))
-    return float(np.exp(log_all) @ right.sum(axis=1))
+        moved = _updated(state.rows(which), found.residual[which, answer], found.S[which, answer])
+        bank.replace(
+            joined([bank.state.rows(others), state, moved]),
+            np.concatenate([bank.log_weight[others], kept, new[which, answer]]),
+            np.repeat([False, not first, True], [len(others), len(rows), len(which)]),
+        )
+    return probability
+
+
+def _updated(prior: InertialState, residual: Array64, S: Array64) -> InertialState:
+    """Each hypothesis after its own answer."""
+    PHt = prior.covariance[:, :, THETA]
+    K = np.swapaxes(np.linalg.solve(S, np.swapaxes(PHt, 1, 2)), 1, 2)
+    after = prior.covariance - K @ np.swapaxes(PHt, 1, 2)
+    after = 0.5 * (after + np.swapaxes(after, 1, 2))
+    step = np.einsum("nij,nj->ni", K, residual)
+    return InertialState(prior.R, prior.xyz_m, prior.velocity_mps, prior.bias, after).moved(step)
 
 
 @dataclass(frozen=True)

@@ -79,6 +79,7 @@ def test_the_tilt_covariance_includes_errors_of_mount_and_lens():
         answer = pair(
             seen(CameraMount.VEHICLE, R_vehicle @ off_v, ATLANTA, seed=seed),
             seen(CameraMount.DRONE, R_drone @ off_d, ATLANTA, seed=seed),
+            tilt_sigma_deg=0.07,
         )
         branches = (turned(0, 0, 25 + quarter).T @ answer.R_vehicle_drone for quarter in (0, 90, 180, 270))
         phi = min((log_rotation(np.ascontiguousarray(off)) for off in branches), key=np.linalg.norm)

@@ -5,10 +5,10 @@
     l_0 = (1 - sum p) / (2 pi)                        no answer is right: any yaw
 
 The bank has hypotheses of two kinds. Those that are *tied* follow the answers; the free ones are for the case that the
-answers are wrong, and use no image. The first image splits each free hypothesis: one for each plausible answer, which is
-tied, and itself, with the probabilities above. Lines of the same streets give the same wrong answers image after image,
-however long, so later images move and weigh the tied hypotheses only among themselves: the odds of tied against free
-change by the drone's motion alone. Of a later image a share f is new evidence, the rest repeats what is known:
+answers are wrong, and use no image. The first image splits each free hypothesis: one for each plausible answer, which
+is tied, and itself, with the probabilities above. Lines of the same streets give the same wrong answers image after
+image, however long, so later images move and weigh the tied hypotheses only among themselves: the odds of tied against
+free change by the drone's motion alone. Of a later image a share f is new evidence, the rest repeats what is known:
 
     w <- (1 - f) w + f w l / sum(w l)                 of the tied hypotheses
 

@@ -1,6 +1,6 @@
 """Noise density of a sampled vector, estimated from the samples: what a smooth local curve does not explain.
 
-Samples are averaged over blocks of BLOCK_S, and a parabola is fitted to the blocks of the last `window_s`; with n
+Samples are averaged over blocks of `block_s`, and a parabola is fitted to the blocks of the last `window_s`; with n
 blocks of duration T and squared residuals q, the density is the root of q T / (n - 3). Blocks, because the noise is not
 white: an autopilot filters its samples (20 Hz), and the rotors shake it at lower frequencies. What counts is the
 density at the frequencies that pass an integration. In the log of a flight (Pixhawk, 50 Hz) the residuals of single
@@ -11,6 +11,9 @@ A window of 0.4 s lets motion below some 3 Hz pass into the parabola: manoeuvres
 with the time constant `average_s`; one window counts at most as LARGEST times the average, because a gust or a
 touch-down is not vibration. Vibration may be a tone: one that is aliased to below 3 Hz is not seen here and acts as a
 bias.
+
+Single samples contain what blocks average out, tones of the rotors above 10 Hz, which thrust may move to any alias. The
+larger one of both densities counts (inertial_motion.py).
 
 Source: ours; A. Savitzky, M. J. E. Golay, "Smoothing and Differentiation of Data by Simplified Least Squares
 Procedures", 1964; cut-off frequency by R. W. Schafer, "What Is a Savitzky-Golay Filter?", IEEE SPM 28(4), 2011.
@@ -25,7 +28,6 @@ import numpy as np
 from stages.geometry.frames import Array64
 
 PARAMETERS = 3  # of a parabola
-BLOCK_S = 0.05  # least duration of a block: frequencies above 10 Hz average out
 LEAST, MOST = 5, 64  # blocks in a window
 LARGEST = 9.0  # one window, relative to the average
 
@@ -33,8 +35,9 @@ LARGEST = 9.0  # one window, relative to the average
 class NoiseDensity:
     """Noise density per axis, of two vectors that are sampled together."""
 
-    def __init__(self, window_s: float, average_s: float) -> None:
-        self._window_ns, self._average_s = round(1e9 * window_s), average_s
+    def __init__(self, block_s: float, window_s: float, average_s: float) -> None:
+        """`block_s`: least duration of a block; 0: each sample is one."""
+        self._block_s, self._window_ns, self._average_s = block_s, round(1e9 * window_s), average_s
         self._sum, self._count = np.zeros(6), 0  # of the open block
         self._ended_ns: int | None = None  # end of the last block
         self._ns: deque[float] = deque(maxlen=MOST)  # middles of the blocks
@@ -63,7 +66,7 @@ class NoiseDensity:
             return
         self._sum, self._count = self._sum + np.concatenate((first, second)), self._count + 1
         block_s = (stamp_ns - self._ended_ns) * 1e-9
-        if block_s < BLOCK_S:
+        if block_s < self._block_s:
             return
         self._ns.append(0.5 * (self._ended_ns + stamp_ns))
         self._values.append(self._sum / self._count)

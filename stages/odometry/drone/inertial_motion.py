@@ -35,7 +35,8 @@ class InertialMotionSettings(Settings):
     """Settings of `InertialMotion`."""
 
     longest_gap_s: float = Field(0.25, gt=0, le=1)  # between two samples of a segment; 10 Hz with one sample lost
-    noise_window_s: float = Field(0.4, gt=0, le=2)  # of the local fit
+    noise_window_s: float = Field(0.22, gt=0, le=2)  # of the local fit to samples; twice that to blocks
+    noise_block_s: float = Field(0.05, gt=0, le=1)  # samples are averaged over: frequencies above 10 Hz
     noise_average_s: float = Field(2.0, gt=0, le=60)
     initial_force_mps2: float = Field(0.35, gt=0)  # noise of a sample, until it is estimated
     initial_rate_radps: float = Field(0.015, gt=0)
@@ -52,7 +53,11 @@ class InertialMotion(Stage[InertialMotionSettings]):
     def __init__(self, settings: InertialMotionSettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
         self._autopilot = AutopilotEstimate(self.settings.autopilot_age_s)
-        self._noise = NoiseDensity(self.settings.noise_window_s, self.settings.noise_average_s)
+        s = self.settings
+        self._noise = (
+            NoiseDensity(0.0, s.noise_window_s, s.noise_average_s),
+            NoiseDensity(s.noise_block_s, 2 * s.noise_window_s, s.noise_average_s),
+        )
         self._false = FalseSamples()
         self._last: DroneImu | None = None
         self._segment = 0
@@ -112,7 +117,8 @@ class InertialMotion(Stage[InertialMotionSettings]):
         )
 
     def _begin(self, imu: DroneImu) -> None:
-        self._noise.new_segment()
+        for noise in self._noise:
+            noise.new_segment()
         self._false.new_segment()
         self._is_false(imu)
         self._add(imu)
@@ -121,11 +127,14 @@ class InertialMotion(Stage[InertialMotionSettings]):
         return self._false.add(imu.stamp_ns, imu.acceleration_drone_mps2, imu.angular_velocity_drone_radps)
 
     def _add(self, imu: DroneImu) -> None:
-        self._noise.add(imu.stamp_ns, imu.acceleration_drone_mps2, imu.angular_velocity_drone_radps)
+        for noise in self._noise:
+            noise.add(imu.stamp_ns, imu.acceleration_drone_mps2, imu.angular_velocity_drone_radps)
         self._last = imu
 
     def _noise_densities(self, dt_s: float) -> tuple[float, float]:
         """Noise densities of specific force and rate over an interval."""
         s, root = self.settings, math.sqrt(dt_s)
-        force, rate = self._noise.density or (s.initial_force_mps2 * root, s.initial_rate_radps * root)
+        known = [noise.density for noise in self._noise if noise.density is not None]
+        known = known or [(s.initial_force_mps2 * root, s.initial_rate_radps * root)]
+        force, rate = (max(part) for part in zip(*known, strict=True))
         return max(force, s.least_force_noise), max(rate, s.least_rate_noise)

@@ -25,7 +25,7 @@ def estimated(
     force: np.ndarray, rate: np.ndarray, hz: float, after_s: float = 4.0, window_s: float = 0.4
 ) -> np.ndarray:
     """Estimates (n, 2) after `after_s`, as white noise of a sample."""
-    noise, found = NoiseDensity(window_s, 2.0), []
+    noise, found = NoiseDensity(0.05, window_s, 2.0), []
     for i, (f, w) in enumerate(zip(force, rate, strict=True)):
         noise.add(round(1e9 * i / hz), f, w)
         if i > after_s * hz:
@@ -89,7 +89,7 @@ def test_a_tone_that_averages_out_is_no_noise():
 
 
 def test_nothing_is_known_before_a_complete_window_and_a_gap_keeps_what_is_known():
-    noise, rng = NoiseDensity(0.4, 2.0), np.random.default_rng(6)
+    noise, rng = NoiseDensity(0.05, 0.4, 2.0), np.random.default_rng(6)
     for i in range(21):  # a sample to begin with, then blocks of three
         noise.add(i * 20_000_000, rng.standard_normal(3), rng.standard_normal(3))
         assert noise.density is None

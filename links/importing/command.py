@@ -1,4 +1,4 @@
-"""`grd info`: what is in a file.
+"""`grd info`: what is in a file; `grd export`: a recording or a run as a ROS 2 bag.
 
 Source: ours.
 """
@@ -12,7 +12,7 @@ import typer
 from rich.table import Table
 
 from flow.link import LinkError
-from links.cli.console import out, report_errors, show_table, warn
+from links.cli.console import out, progress_bar, report_errors, show_table, warn
 
 MAX_FACT_CHARACTERS = 200
 
@@ -54,3 +54,31 @@ def info(
     else:
         mapping.write_text(found.mapping.yaml(), encoding="utf-8")
         out.print(f"wrote {mapping}", markup=False)
+
+
+@report_errors
+def export(
+    source: Annotated[Path, typer.Argument(help="A recording, or the folder of a run.")],
+    out_folder: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder to write [default: next to SOURCE, NAME_ros2].")
+    ] = None,
+    recording: Annotated[
+        Path | None, typer.Option("--recording", help="Recording of the run, to add the sensors' data.")
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing bag.")] = False,
+) -> None:
+    """Write a recording or a run as a ROS 2 bag (MCAP) for RViz, Foxglove and ros2 bag play.
+
+    Example: grd export out/street_sweep-replay --recording recordings/street_sweep.mcap
+    """
+    from links.ros.export import export as write
+
+    if recording is not None and not source.is_dir():
+        raise LinkError("--recording adds the sensors' data to a run's folder: without it give the recording itself")
+    target = out_folder or source.absolute().parent / f"{source.absolute().stem}_ros2"
+    with progress_bar(f"export {source.name}") as step:
+        report = write(source, target, recording=recording, overwrite=overwrite, progress=step)
+    for text in report.warnings:
+        warn(text)
+    topics = ", ".join(f"{count} on {topic}" for topic, count in report.topics.items())
+    out.print(f"{report.path}: {topics}", markup=False)

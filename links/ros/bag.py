@@ -55,7 +55,7 @@ class Bag:
             import rosbags.highlevel
         except ModuleNotFoundError:
             raise LinkError(
-                f"{path} is a ROS bag: to read it install the package rosbags (pip install rosbags)"
+                f"{path} is a ROS bag: to read it install the extra ros (pip install 'grd-pose[ros]')"
             ) from None
         self._store = typestore()
         self.parts, self.warnings = _parts(path)

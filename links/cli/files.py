@@ -28,7 +28,7 @@ def import_recording(
     file: Annotated[
         Path,
         typer.Argument(
-            help="A capture (.pcap), a MAVLink log (.tlog), a ROS bag, or the beams of one LiDAR (.json, .csv)."
+            help="A capture (.pcap), a log (.tlog, .bin, .ulg), a ROS bag, or the beams of one LiDAR (.json, .csv)."
         ),
     ],
     out_file: Annotated[

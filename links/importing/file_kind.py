@@ -22,7 +22,10 @@ SNIFF_BYTES = 4096
 RUN_FILES = ("summary.json", "run.log")
 _ROS1, _SQLITE, _ULOG, _DATAFLASH = b"#ROSBAG V2.0", b"SQLite format 3\0", b"ULog\x01\x12\x35", b"\xa3\x95\x80"
 _ZSTD = b"\x28\xb5\x2f\xfd"
-IMPORTED = "a pcap capture, a MAVLink log (.tlog), a ROS bag (.bag, .db3, .mcap or their folder)"
+IMPORTED = (
+    "a pcap capture, a MAVLink log (.tlog), an ArduPilot log (.bin), a PX4 log (.ulg), "
+    "a ROS bag (.bag, .db3, .mcap or their folder)"
+)
 
 
 class FileKind(StrEnum):

@@ -14,9 +14,11 @@ from pathlib import Path
 
 from flow.link import LinkError
 from links.importing.capture import Capture
+from links.importing.dataflash import DataflashLog
 from links.importing.file_kind import IMPORTED, FileKind, file_bytes, file_kind
 from links.importing.imported_file import ImportedFile
 from links.importing.telemetry_log import TelemetryLog
+from links.importing.ulog_file import UlogFile
 from links.lidar import rig_unit
 from links.recording.format import Progress
 from links.recording.reader import open_file
@@ -115,6 +117,10 @@ def _open(
         from links.importing.rosbag_file import RosbagFile
 
         return stack.enter_context(RosbagFile(source, mapping, unit))
+    if kind is FileKind.DATAFLASH:
+        return DataflashLog(source)
+    if kind is FileKind.ULOG:
+        return UlogFile(source)
     raise LinkError(f"{source} is none of the files that can be imported: {IMPORTED}")
 
 

@@ -14,9 +14,11 @@ from pathlib import Path
 from typing import Any
 
 from flow.link import LinkError
+from links.importing.dataflash import DataflashLog
 from links.importing.file_kind import IMPORTED, FileKind, file_bytes, file_kind
 from links.importing.pcap import PcapReport, read_datagrams
 from links.importing.tlog import TlogReport, read_frames
+from links.importing.ulog_file import read_ulog
 from links.lidar import recognised_model, rig_unit
 from links.recording import Session
 from links.recording.format import topic as declared
@@ -124,6 +126,25 @@ def _log(info: FileInfo, times: list[int], counts: Counter[tuple[str, str]], war
     info.warnings += warnings
 
 
+def _dataflash(path: Path, info: FileInfo) -> None:
+    log = DataflashLog(path)
+    counts, times = Counter[tuple[str, str]](), []
+    for message in log.messages():
+        counts["1, 1", message.get_type()] += 1
+        times = [*times[:1], 1000 * round(1e6 * message._timestamp)]
+    _log(info, times, counts, log.warnings())
+
+
+def _ulog(path: Path, info: FileInfo) -> None:
+    log = read_ulog(path)
+    seconds = (log.last_timestamp - log.start_timestamp) * 1e-6
+    hardware = log.msg_info_dict.get("ver_hw", "unknown")
+    info.facts += [("hardware", str(hardware)), ("duration", f"{seconds:.2f} s")]
+    info.columns = ("topic", "instance", "messages", "per second")
+    each = ((d.name, d.multi_id, len(d.data["timestamp"])) for d in log.data_list)
+    info.rows = [(name, str(number), str(count), _rate(count, seconds)) for name, number, count in sorted(each)]
+
+
 def _run(path: Path, info: FileInfo) -> None:
     summary = path / "summary.json"
     values: dict[str, Any] = {}
@@ -147,6 +168,8 @@ _READERS: dict[FileKind, Callable[[Path, FileInfo], None]] = {
     FileKind.BAG: _bag,
     FileKind.CAPTURE: _capture,
     FileKind.TELEMETRY: _telemetry,
+    FileKind.DATAFLASH: _dataflash,
+    FileKind.ULOG: _ulog,
     FileKind.RUN: _run,
 }
 

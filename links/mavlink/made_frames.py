@@ -16,6 +16,7 @@ from links.mavlink.transport.framing import dialect
 
 TOPIC = "/autopilot/rx"
 HEARTBEAT_NS = BEFORE_FIRST_NS = 1_000_000_000
+OUT_OF_ORDER_NS = 1_000_000_000  # values logged later than others by less than this arrive with them
 ARDUPILOT, PX4, GENERIC = 3, 12, 0  # MAV_AUTOPILOT
 _QUADROTOR, _ARMED, _ACTIVE, _STANDBY = 2, 128, 4, 3
 _ALL_IMU_FIELDS = 0b111111  # accelerations and rates were updated
@@ -42,6 +43,7 @@ class FrameMaker:
         self._mavlink = dialect().MAVLink(None, srcSystem=1, srcComponent=1)
         self._boot_ns: int | None = None
         self._heartbeat_ns: int | None = None
+        self._newest_ns = 0
         self.armed = False
 
     def imu(
@@ -118,6 +120,9 @@ class FrameMaker:
 
     def _frames(self, arrival_ns: int, stamp_ns: int, make: Any) -> Iterator[Record]:
         """The frame of `make(microseconds since boot)`, after a HEARTBEAT that is due."""
+        if self._newest_ns - OUT_OF_ORDER_NS < arrival_ns < self._newest_ns:  # their sequence numbers are in order
+            arrival_ns = self._newest_ns
+        self._newest_ns = arrival_ns
         if self._boot_ns is None:
             self._boot_ns = stamp_ns - BEFORE_FIRST_NS
         if self._heartbeat_ns is None or arrival_ns >= self._heartbeat_ns + HEARTBEAT_NS:

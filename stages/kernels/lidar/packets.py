@@ -2,7 +2,9 @@
 
 A packet is a row of blocks, each with an azimuth and one entry (range, reflectivity) per pulse. Where its fields are is
 described by three arrays, made by `links/lidar/packet_format.py`: LAYOUT, SCALES, and a row of PULSE_COLUMNS per pulse
-of a block. Positions are unsigned: for signed ones numba also compiles the way from the end. Source: see `links/lidar/decode.py`.
+of a block. Positions are unsigned: for signed ones numba also compiles counting from the end.
+
+Source: see `links/lidar/decode.py`.
 """
 
 from __future__ import annotations

@@ -20,6 +20,7 @@ from links.cli.preflight import preflight
 from links.cli.run import replay_recording, run
 from links.cli.simulate import fly_scenarios, simulate_matrix, simulate_recording
 from links.cli.verify import verify
+from links.importing.command import export, info
 
 app = typer.Typer(
     name="grd",
@@ -34,6 +35,8 @@ app.command("check")(check)
 app.command("graph")(graph)
 app.command("schema")(schema)
 app.command("import")(import_recording)
+app.command("info")(info)
+app.command("export")(export)
 app.command("recover")(recover_recording)
 app.command("simulate")(simulate_recording)
 app.command("matrix")(simulate_matrix)

@@ -22,6 +22,8 @@ from links.lidar.velodyne import RETURN_MODE_AT
 from stages.kernels.lidar.packets import Rows, decode
 from stages.messages import LidarFirings
 
+PACKETS_AT_ONCE = 16  # a message that is kept holds the memory of so many: 0.2 MB for a VLP-16
+
 
 class FiringRows:
     """Collects the pulses of consecutive data packets into one LidarFirings message."""
@@ -30,11 +32,15 @@ class FiringRows:
         """`max_packets`: packets in a message."""
         self._form = form
         self._max_packets = max_packets
-        self._start()
+        self.packets = self._stamp_ns = self._lost_packets = 0
+        self._first = self._count = 0  # rows of this message, in the arrays
+        self._size = 0
+        self._make_room()
 
-    def _start(self) -> None:
-        size = self._max_packets * self._form.max_rows
-        self.packets = self._count = self._stamp_ns = self._lost_packets = 0
+    def _make_room(self) -> None:
+        """New arrays, of which the next messages get a part each: one allocation for PACKETS_AT_ONCE packets."""
+        self._size = size = max(self._max_packets, PACKETS_AT_ONCE) * self._form.max_rows
+        self._first = self._count = 0
         self._rows = Rows(
             pulse_stamp_ns=np.empty(size, np.int64),
             laser=np.empty(size, np.uint8),
@@ -71,20 +77,23 @@ class FiringRows:
 
     def take(self) -> LidarFirings:
         """The message of all packets added since the previous call."""
-        rows, count = self._rows, self._count
+        part = slice(self._first, self._count)
+        pulse_stamp_ns, laser, azimuth_rad, range_m, reflectivity, return_kind, xyz_lidar_m = self._rows
         firings = LidarFirings(
             stamp_ns=self._stamp_ns,
-            pulse_stamp_ns=rows.pulse_stamp_ns[:count],
-            laser=rows.laser[:count],
-            azimuth_rad=rows.azimuth_rad[:count],
-            range_m=rows.range_m[:count],
-            reflectivity=rows.reflectivity[:count],
-            return_kind=rows.return_kind[:count],
-            xyz_lidar_m=rows.xyz_lidar_m[:count],
+            pulse_stamp_ns=pulse_stamp_ns[part],
+            laser=laser[part],
+            azimuth_rad=azimuth_rad[part],
+            range_m=range_m[part],
+            reflectivity=reflectivity[part],
+            return_kind=return_kind[part],
+            xyz_lidar_m=xyz_lidar_m[part],
             lost_packets=self._lost_packets,
             laser_elevation_rad=self._form.elevation_rad,
         )
-        self._start()
+        self.packets, self._first = 0, self._count
+        if self._count + self._max_packets * self._form.max_rows > self._size:
+            self._make_room()
         return firings
 
 

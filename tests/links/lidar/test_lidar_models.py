@@ -21,12 +21,12 @@ from scipy.spatial import cKDTree
 from flow.counters import Counters
 from flow.graph import load_graph
 from flow.link import LinkError, Record
+from links.importing.pcap import PcapReport, read_datagrams
 from links.lidar import Lidar, hesai_beams, ouster_beams, recognised_model
 from links.lidar.checks import LidarObservation, lidar_checks
 from links.lidar.reject_reason import PacketRejectReason
 from links.preflight.check_result import Level
 from links.preflight.observations import ObservedSource
-from links.recording.pcap import PcapReport, read_datagrams
 from links.simulated.rig.scenario import RigLidar as ScenarioLidar
 from links.simulated.sensors.lidar_packets import PacketEncoder
 from stages.aim.beams import Rotor

@@ -12,8 +12,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from pymavlink.generator.mavcrc import x25crc
 
 from flow.link import LinkError, Record
-from links.recording import ImportReport, RecordingReader, import_file
-from links.recording.tlog import BLOCK_BYTES, TlogReport, read_frames, x25
+from links.importing import ImportReport, import_file
+from links.importing.tlog import BLOCK_BYTES, TlogReport, read_frames, x25
+from links.recording import RecordingReader
 
 SHARED = Path(__file__).resolve().parents[4] / "shared" / "data" / "mavlink"
 T0_US = 1_700_000_000_000_000
@@ -158,7 +159,7 @@ def test_the_size_of_a_block_changes_nothing(tmp_path: Path, block: int, monkeyp
     sent = frames(count=30)
     content = tlog([*sent[:9], b"\x01\x02\xfe\x03garbage", *sent[9:]])
     whole, records = run(tmp_path, content)
-    monkeypatch.setattr("links.recording.tlog.BLOCK_BYTES", block)
+    monkeypatch.setattr("links.importing.tlog.BLOCK_BYTES", block)
     report, again = run(tmp_path, content)
     assert [r.data for r in again] == [r.data for r in records] == sent
     assert (report.skipped, report.warnings) == (whole.skipped, whole.warnings)
@@ -166,10 +167,10 @@ def test_the_size_of_a_block_changes_nothing(tmp_path: Path, block: int, monkeyp
 
 def test_a_file_that_is_neither_capture_nor_log_is_rejected_and_a_recording_is_recognised(tmp_path: Path):
     (tmp_path / "a.bin").write_bytes(b"something else")
-    with pytest.raises(LinkError, match="neither a pcap capture nor a MAVLink telemetry log"):
+    with pytest.raises(LinkError, match="none of the files that can be imported: a pcap capture"):
         import_file(tmp_path / "a.bin")
     report, _ = run(tmp_path, tlog(frames()))
-    with pytest.raises(LinkError, match="is an MCAP file already"):
+    with pytest.raises(LinkError, match="is a recording already"):
         import_file(report.path, tmp_path / "b.mcap")
     with pytest.raises(LinkError, match="no such file"):
         import_file(tmp_path / "none.tlog")

@@ -10,8 +10,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from flow.link import LinkError, Record
-from links.recording import ImportReport, RecordingReader, import_file
-from links.recording.importing import DEFAULT_RIG
+from links.importing import ImportReport, import_file
+from links.importing.imported_file import DEFAULT_RIG
+from links.recording import RecordingReader
 from stages.geometry.frames import LidarMount
 
 SHARED = Path(__file__).resolve().parents[4] / "shared" / "data" / "lidar"

@@ -18,8 +18,8 @@ from collections import deque
 import numpy as np
 
 from stages.geometry.frames import Array64
+from stages.kernels.odometry.noise import residual_variance
 
-PARAMETERS = 3  # of a parabola
 LEAST, MOST = 5, 64  # samples in a window
 LARGEST = 9.0  # one window, relative to the average
 
@@ -65,11 +65,3 @@ class SampleNoise:
             return
         share = max(1.0 - np.exp(-since_s / self._average_s), 1.0 / self._windows)
         self._variance = self._variance + share * (np.minimum(new, LARGEST * self._variance) - self._variance)
-
-
-def residual_variance(stamp_ns: Array64, values: Array64) -> Array64:
-    """Variance (m,) of white noise in values (n, m): residuals of a parabola in time, n > 3."""
-    t = (stamp_ns - stamp_ns[0]) / max(float(stamp_ns[-1] - stamp_ns[0]), 1.0) - 0.5
-    basis, _ = np.linalg.qr(np.column_stack((np.ones(len(t)), t, t * t)))
-    residual = values - basis @ (basis.T @ values)
-    return np.sum(residual**2, axis=0) / (len(t) - PARAMETERS)

@@ -112,7 +112,8 @@ class VehicleTrajectory:
     def _append(self, motion: VehicleMotion) -> None:
         self._cache.clear()
         self._rates = None
-        self._poses.append((motion.stamp_ns, *self._in_map(motion)))
+        R, t = self._in_map(motion)
+        self._poses.append((motion.stamp_ns, np.ascontiguousarray(R), np.ascontiguousarray(t)))
 
     def _start_frame(self, first: VehicleMotion) -> None:
         """Begin a new start frame with this pose; earlier poses no longer contribute to the velocity."""

@@ -19,9 +19,6 @@ from stages.geometry.frames import Array64, LidarMount
 from stages.kernels.sweep.turntable import Firings, Pulses, Returns, place_slice, turns_at
 from stages.messages import LidarFirings, ServoState, SweptPoints, SweptPulses
 
-# shape of a row and type of the arrays of `Returns` and `Pulses`
-RETURNS = (((), np.int64), ((3,), np.float32), ((), np.uint8), ((), np.uint8), ((), np.float32))
-PULSES = (((), np.int64), ((3,), np.float32), ((), np.float32), ((), np.uint8), ((), np.uint8))
 STATES_KEPT = 512  # 5 s at 100 Hz: longer than any packet waits
 
 
@@ -111,8 +108,20 @@ class Turntable:
         A return without an angle is omitted and counted; pulses are empty unless the angle is known for all of them.
         """
         n = firings.pulse_stamp_ns.size
-        returns = Returns(*(np.empty((n, *shape), dtype) for shape, dtype in RETURNS))
-        pulses = Pulses(*(np.empty((n, *shape), dtype) for shape, dtype in PULSES))
+        returns = Returns(
+            stamp_ns=np.empty(n, np.int64),
+            xyz_m=np.empty((n, 3), np.float32),
+            laser=np.empty(n, np.uint8),
+            reflectivity=np.empty(n, np.uint8),
+            turntable_rad=np.empty(n, np.float32),
+        )
+        pulses = Pulses(
+            stamp_ns=np.empty(n, np.int64),
+            direction=np.empty((n, 3), np.float32),
+            range_m=np.empty(n, np.float32),
+            laser=np.empty(n, np.uint8),
+            reflectivity=np.empty(n, np.uint8),
+        )
         placed, unplaced, count, fired, origin = place_slice(
             Firings(
                 firings.pulse_stamp_ns,

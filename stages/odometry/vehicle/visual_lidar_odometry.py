@@ -24,6 +24,7 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from flow.stage import Settings, Stage
@@ -65,8 +66,8 @@ class _Now:
     poses: deque[tuple[int, Array64, Array64]] = field(  # the last two: stamp, T_map_camera
         default_factory=lambda: deque[tuple[int, Array64, Array64]](maxlen=2)
     )
-    waiting: deque[tuple[int, Array64]] = field(  # LiDAR slices not yet placed, camera frame
-        default_factory=lambda: deque[tuple[int, Array64]](maxlen=WAITING_SLICES)
+    waiting: deque[tuple[NDArray[np.int64], Array64]] = field(  # LiDAR slices not yet placed: stamps, camera frame
+        default_factory=lambda: deque[tuple[NDArray[np.int64], Array64]](maxlen=WAITING_SLICES)
     )
     cloud: deque[Array64] = field(default_factory=lambda: deque[Array64]())  # placed, start frame
     lengths: int = 0  # number of lengths measured

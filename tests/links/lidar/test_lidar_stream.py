@@ -32,7 +32,7 @@ SWEEP = """\
 stages:
   sweep: {use: stages.sweep.Sweep, config: {mount: {turns: false}}, inputs: {firings: lidar.lidar_firings}}
 links:
-  lidar: {use: links.lidar.Lidar}
+  lidar: {use: links.lidar.Lidar, config: {slice_ms: 0.1}}
 """
 
 

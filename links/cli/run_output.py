@@ -66,7 +66,8 @@ def print_result(run: RunResult) -> None:
         out.print(f"rejected: {'; '.join(rejected)}", markup=False)
     if run.usage is not None and str(run.usage):
         out.print(f"used: {run.usage}")
-    out.print(f"output hash {run.output_hash}")
+    if run.output_hash is not None:
+        out.print(f"output hash {run.output_hash}")
     if not run.stage_outputs:
         out.print(f"positions   {run.out_dir / FIX_FILE}")
     if results.pose_states:

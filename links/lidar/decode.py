@@ -22,25 +22,19 @@ from links.lidar.velodyne import RETURN_MODE_AT
 from stages.kernels.lidar.packets import Rows, decode
 from stages.messages import LidarFirings
 
-PACKETS_AT_ONCE = 16  # a message that is kept holds the memory of so many: 0.2 MB for a VLP-16
-
 
 class FiringRows:
-    """Collects the pulses of consecutive data packets into one LidarFirings message."""
+    """Collects the pulses of the consecutive data packets of a slice into one LidarFirings message."""
 
-    def __init__(self, form: AnyFormat, max_packets: int) -> None:
-        """`max_packets`: packets in a message."""
-        self._form = form
-        self._max_packets = max_packets
-        self.packets = self._stamp_ns = self._lost_packets = 0
-        self._first = self._count = 0  # rows of this message, in the arrays
-        self._size = 0
-        self._make_room()
+    def __init__(self, form: AnyFormat, slice_ns: int) -> None:
+        self._form, self._slice_ns = form, slice_ns
+        self.packets = 0
 
-    def _make_room(self) -> None:
-        """New arrays, of which the next messages get a part each: one allocation for PACKETS_AT_ONCE packets."""
-        self._size = size = max(self._max_packets, PACKETS_AT_ONCE) * self._form.max_rows
-        self._first = self._count = 0
+    def _start(self, packet_ns: int) -> None:
+        """Make room for the whole packets, at least one, whose duration is nearest to the slice's."""
+        self._max_packets = max(1, round(self._slice_ns / packet_ns))
+        size = self._max_packets * self._form.max_rows
+        self._count = 0
         self._rows = Rows(
             pulse_stamp_ns=np.empty(size, np.int64),
             laser=np.empty(size, np.uint8),
@@ -53,8 +47,8 @@ class FiringRows:
 
     @property
     def full(self) -> bool:
-        """Whether `max_packets` packets are in it."""
-        return self.packets == self._max_packets
+        """Whether the slice is complete."""
+        return self.packets > 0 and self.packets == self._max_packets
 
     def add(self, data: bytes, stamp_ns: int, lost_packets: int) -> bool:
         """Add every pulse of a packet that `reject_reason` accepts and whose first laser fired at stamp_ns.
@@ -66,6 +60,8 @@ class FiringRows:
         """
         form = self._form
         dual = form.return_mode(data) == "dual"
+        if self.packets == 0:
+            self._start(form.duration_ns(data))
         rows = decode(data, stamp_ns, dual, form.layout, form.scales, form.pulses, self._count, *self._rows)
         if rows == 0:
             return False
@@ -77,24 +73,20 @@ class FiringRows:
 
     def take(self) -> LidarFirings:
         """The message of all packets added since the previous call."""
-        part = slice(self._first, self._count)
-        pulse_stamp_ns, laser, azimuth_rad, range_m, reflectivity, return_kind, xyz_lidar_m = self._rows
-        firings = LidarFirings(
+        rows, count = self._rows, self._count
+        self.packets = 0
+        return LidarFirings(
             stamp_ns=self._stamp_ns,
-            pulse_stamp_ns=pulse_stamp_ns[part],
-            laser=laser[part],
-            azimuth_rad=azimuth_rad[part],
-            range_m=range_m[part],
-            reflectivity=reflectivity[part],
-            return_kind=return_kind[part],
-            xyz_lidar_m=xyz_lidar_m[part],
+            pulse_stamp_ns=rows.pulse_stamp_ns[:count],
+            laser=rows.laser[:count],
+            azimuth_rad=rows.azimuth_rad[:count],
+            range_m=rows.range_m[:count],
+            reflectivity=rows.reflectivity[:count],
+            return_kind=rows.return_kind[:count],
+            xyz_lidar_m=rows.xyz_lidar_m[:count],
             lost_packets=self._lost_packets,
             laser_elevation_rad=self._form.elevation_rad,
         )
-        self.packets, self._first = 0, self._count
-        if self._count + self._max_packets * self._form.max_rows > self._size:
-            self._make_room()
-        return firings
 
 
 def compile_kernels() -> None:

@@ -41,7 +41,7 @@ class RunResult:
     report: RunReport
     results: Results
     errors: FixErrors | None  # None: the truth is not known
-    output_hash: str
+    output_hash: str | None  # None: not computed
     wall_s: float
     warnings: list[str]
     usage: Usage | None = None  # of a live run

@@ -26,8 +26,8 @@ from collections import deque
 import numpy as np
 
 from stages.geometry.frames import Array64
+from stages.kernels.odometry.noise import residual_variance
 
-PARAMETERS = 3  # of a parabola
 LEAST, MOST = 5, 64  # blocks in a window
 LARGEST = 9.0  # one window, relative to the average
 
@@ -40,7 +40,7 @@ class NoiseDensity:
         self._block_s, self._window_ns, self._average_s = block_s, round(1e9 * window_s), average_s
         self._sum, self._count = np.zeros(6), 0  # of the open block
         self._ended_ns: int | None = None  # end of the last block
-        self._ns: deque[float] = deque(maxlen=MOST)  # middles of the blocks
+        self._ns: deque[int] = deque(maxlen=MOST)  # middles of the blocks
         self._values: deque[Array64] = deque(maxlen=MOST)
         self._variance: Array64 | None = None  # (2,), mean over the axes, times the duration of a block
         self._windows = 0
@@ -68,7 +68,7 @@ class NoiseDensity:
         block_s = (stamp_ns - self._ended_ns) * 1e-9
         if block_s < self._block_s:
             return
-        self._ns.append(0.5 * (self._ended_ns + stamp_ns))
+        self._ns.append((self._ended_ns + stamp_ns) // 2)
         self._values.append(self._sum / self._count)
         self._sum, self._count, self._ended_ns = np.zeros(6), 0, stamp_ns
         self._add_block(block_s)
@@ -88,11 +88,3 @@ class NoiseDensity:
             return
         share = max(1.0 - np.exp(-block_s / self._average_s), 1.0 / self._windows)
         self._variance = self._variance + share * (np.minimum(new, LARGEST * self._variance) - self._variance)
-
-
-def residual_variance(stamp_ns: Array64, values: Array64) -> Array64:
-    """Variance (m,) of white noise in values (n, m): residuals of a parabola in time, n > 3."""
-    t = (stamp_ns - stamp_ns[0]) / max(float(stamp_ns[-1] - stamp_ns[0]), 1.0) - 0.5
-    basis, _ = np.linalg.qr(np.column_stack((np.ones(len(t)), t, t * t)))
-    residual = values - basis @ (basis.T @ values)
-    return np.sum(residual**2, axis=0) / (len(t) - PARAMETERS)

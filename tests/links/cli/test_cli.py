@@ -103,6 +103,17 @@ def test_two_replays_have_one_hash_and_one_never_overwrites_the_other(grd, tmp_p
     assert "has a run already" in again
 
 
+def test_a_replay_without_the_hash_leaves_the_same_fixes(grd, tmp_path):
+    overlay = without_viewer(tmp_path)
+    grd("replay", STREET, "--overlay", overlay, "--out", "a")
+    text = grd("replay", STREET, "--overlay", overlay, "--out", "b", "--no-hash")
+    assert "output hash" not in text
+    assert json.loads((tmp_path / "b" / "summary.json").read_text())["output_hash"] is None
+    fixes = [(tmp_path / name / "fix_vehicle_drone.tum").read_text() for name in "ab"]
+    assert fixes[0] == fixes[1]
+    assert "--no-hash" in grd("replay", STREET, "--no-hash", "--expect", "0" * 16, code=2)
+
+
 @pytest.mark.skipif(not can_use_subprocesses(), reason="one core, or no fork: there is one process anyway")
 def test_a_replay_in_several_processes_writes_the_files_of_one(grd, tmp_path, monkeypatch):
     started = []

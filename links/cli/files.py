@@ -175,9 +175,27 @@ def _size(text: str) -> str:
     return text
 
 
+def _rrd_of(run: Path | None) -> Path:
+    """The .rrd file of a run; of None: of the newest run in out/. LinkError when there is none."""
+    if run is None:
+        found = sorted(Path("out").glob("*/*.rrd"), key=lambda file: file.stat().st_mtime)
+        if not found:
+            raise LinkError("out/ holds no run with a run.rrd: name the folder of a run, or: grd run quickstart")
+        out.print(f"the newest run: {found[-1]}", markup=False)
+        return found[-1]
+    if not run.is_dir():
+        return run
+    file = next(iter(sorted(run.glob("*.rrd"))), None)
+    if file is None:
+        raise LinkError(f"{run} holds no run.rrd: its configuration has no viewer (links.viewer.Viewer)")
+    return file
+
+
 @report_errors
 def view(
-    rrd: Annotated[Path, typer.Argument(help="The run.rrd of a run.")],
+    run: Annotated[
+        Path | None, typer.Argument(help="Folder of a run, or its run.rrd [default: the newest run in out/].")
+    ] = None,
     png: Annotated[
         Path | None,
         typer.Option("--screenshot", help="Write an image instead of opening a window (no display needed)."),
@@ -192,10 +210,11 @@ def view(
 
     With --screenshot the exit code is 1 when a view has errors.
 
-    Example: grd view out/street_sweep-replay/run.rrd --screenshot run.png
+    Example: grd view out/experiment_1-quickstart --screenshot run.png
     """
     from links.viewer import screenshot, show
 
+    rrd = _rrd_of(run)
     if png is None:
         if tab is not None:
             raise LinkError("--tab selects the tab of an image: add --screenshot FILE.png")

@@ -13,9 +13,10 @@ import typer
 from flow.graph import recording_named
 from flow.link import LinkError
 from flow.live.report import LiveReport
-from links.cli.console import EXIT_FAILED, err, out, progress_bar, report_errors, warn
+from links.cli.console import EXIT_FAILED, err, out, progress_bar, report_errors, show_table, warn
 from links.cli.live_view import LiveView
 from links.cli.run_output import nothing_found, print_result
+from links.cli.side_by_side import side_by_side
 from links.runs.as_live import rerun_into
 from links.runs.live_run import live_graph, run_live
 from links.runs.output_hashes import hash_matches
@@ -64,6 +65,16 @@ def run(
         Path | None, typer.Option("--hosts", metavar="FILE", help="Live on several hosts: see links/zenoh/README.md.")
     ] = None,
     host: Annotated[str | None, typer.Option("--host", metavar="NAME", help="Name of this host in FILE.")] = None,
+    against: Annotated[
+        Path | None,
+        typer.Option(
+            "--against",
+            metavar="CONFIG",
+            callback=shipped_option,
+            help="Then run this configuration, on its own recording or else on the same one, and print both runs "
+            "side by side.",
+        ),
+    ] = None,
     view: View = False,
 ) -> None:
     """Run CONFIG live, or over the recording that its `replay:` names.
@@ -71,7 +82,7 @@ def run(
     A live run is recorded (`links.recording.Recorder`); Ctrl-C or SIGTERM ends it. Exit code 1 when a stage stopped
     the run or was switched off after repeated errors, when no sensor sent anything, or no drone was found.
 
-    Example: grd run configs/quickstart.yaml --set track.radius_m=0.8
+    Example: grd run configs/quickstart.yaml --against configs/quickstart_paper.yaml
     """
     if config.suffix == ".mcap":
         raise LinkError(f"{config} is a recording: grd replay {config}")
@@ -82,8 +93,13 @@ def run(
         if for_s is not None or hosts is not None:
             option = "--for" if for_s is not None else "--hosts"
             raise LinkError(f"{option} is for live runs, and {config} replays {recording.name}: leave it out")
-        _run(recording, config, out_dir, overlay or [], sets or [], view)
+        result = _run(recording, config, out_dir, overlay or [], sets or [], view)
+        if against is not None:
+            other = _run_against(against, recording, out_dir)
+            show_table(side_by_side([(config.stem, result), (against.stem, other)]))
         return
+    if against is not None:
+        raise LinkError(f"--against is for a configuration that replays a recording, and {config} runs live")
     err.print(f"loading {config}", markup=False)
     request = RunRequest(config, tuple(overlay or ()), tuple(sets or ()))
     graph, folder = live_graph(request), _new_folder(out_dir, f"live-{config.stem}")
@@ -206,6 +222,13 @@ def _run(
     if view:
         _open_viewer(result.out_dir)
     return result
+
+
+def _run_against(config: Path, recording: Path, out_dir: Path | None) -> RunResult:
+    """Run another configuration on the recording that it names, or else on this one."""
+    own = recording_named(config, (), ())
+    folder = None if out_dir is None else out_dir.with_name(f"{out_dir.name}-{config.stem}")
+    return _run(own or recording, config, folder, [], [], False)
 
 
 def _rerun(recording: Path, out_dir: Path | None, view: bool, trusted: bool) -> str | None:

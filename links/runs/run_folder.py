@@ -25,6 +25,7 @@ from flow.taps import Digest
 from links.lidar import Lidar, recorded_lidars
 from links.mavlink.autopilot import Autopilot
 from links.recording import Progress, Session
+from links.runs.fused_poses import read_fused_poses
 from links.runs.request import RunRequest, RunResult
 from links.runs.result_file import ResultFile
 from links.runs.results import SUMMARY_FILE, Results
@@ -121,6 +122,7 @@ class RunFolder:
             report=report,
             results=self._results,
             errors=truth.fix_errors_of(self._results.fixes),
+            poses=read_fused_poses(self._folder, truth),
             output_hash=output_hash,
             wall_s=time.monotonic() - self._started_s,
             warnings=warnings,

@@ -97,6 +97,11 @@ def simulate_matrix(
     ] = False,
     odometry: Annotated[bool, typer.Option("--odometry", help="The vehicle sends odometry.")] = False,
     rain: Annotated[bool, typer.Option("--rain", help="Rain of 5 mm/h.")] = False,
+    sparse: Annotated[bool, typer.Option("--sparse", help="Fewer rays per LiDAR pulse, in half the time.")] = False,
+    varied_sky: Annotated[
+        bool,
+        typer.Option("--varied-sky", help="Gliding, circling and hovering birds, flocks, insects, kites, bags."),
+    ] = False,
     autopilot: Annotated[
         bool, typer.Option("--autopilot", help="The drone sends telemetry over a radio, and obeys flight dynamics.")
     ] = False,
@@ -169,7 +174,10 @@ def simulate_matrix(
             out.print(cell.name, markup=False)
         return
     size_px = cameras_px or Conditions.cameras_px
-    conditions = Conditions(calibrated, odometry, rain, autopilot, cameras_hz, size_px, readout_ms or 0.0, perturbed)
+    shutter_ms = readout_ms or 0.0
+    conditions = Conditions(
+        calibrated, odometry, rain, autopilot, cameras_hz, size_px, shutter_ms, perturbed, sparse, varied_sky
+    )
     several = range(first_seed, first_seed + seeds)
     with progress_bar(f"{len(selected) * seeds} recordings") as step:
         report = make_matrix(folder, selected, several, closed_loop, step, conditions, results, jobs, images)

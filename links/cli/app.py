@@ -15,6 +15,7 @@ from links.cli.lens import import_lens
 from links.cli.preflight import preflight
 from links.cli.run import replay_recording, run
 from links.cli.simulate import simulate_matrix, simulate_recording
+from links.cli.train import train_detector
 from links.cli.verify import verify
 
 app = typer.Typer(
@@ -38,6 +39,7 @@ app.command("view")(view)
 app.command("preflight")(preflight)
 app.command("calibrate")(calibrate_recording)
 app.command("lens")(import_lens)
+app.command("train-detector")(train_detector)
 app.command("evaluate")(evaluate_runs)
 app.command("verify")(verify)
 

@@ -75,9 +75,7 @@ class Candidate:
     scan_passes: int = 1  # passes of the rotor in which it was observed
     missed_returns: float = 0.0  # expected returns that did not come
     born_ns: int = 0  # its first observation
-    existence_nats: float = (
-        0.0  # log-odds that one object causes its observations, see trained/existence.py
-    )
+    existence_nats: float = 0.0  # log-odds that one object causes its observations, see trained/existence.py
     false_per_s: float = LEAST_FALSE_PER_S  # rate of false returns at its range, at its last observation
     passed_pulses: float = 0.0  # pulses through its middle in scan passes without a return
     observations: int = 0

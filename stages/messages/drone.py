@@ -95,9 +95,7 @@ class CandidateLog(Message):
     seen_ns: PerPointI64  # its last observation
     xyz_vehicle_m: Points64  # at seen_ns
     probability: PerPointF64
-    features: Annotated[
-        NDArray[np.float64], Shape("n", "k")
-    ]  # trained/features.py; NaN: not available
+    features: Annotated[NDArray[np.float64], Shape("n", "k")]  # trained/features.py; NaN: not available
     feature_names: tuple[str, ...]
     detector_instance: int = 0
 

@@ -10,7 +10,7 @@
         needs: $rig.cameras                # the stage is left out where the configuration has no such value
         low_priority: true                 # live: fewer images while other queues overflow: flow/live/backpressure.py
     links:
-      lidar: {use: links.velodyne.Lidar}   # sources and sinks: use, config, inputs, needs
+      lidar: {use: links.lidar.Lidar}   # sources and sinks: use, config, inputs, needs
 
 Source: ours.
 """
@@ -27,6 +27,7 @@ import yaml
 from flow.config.classes import KINDS
 from flow.config.edge import Edge, read_edges
 from flow.config.node_spec import NodeSpec, read_nodes
+from flow.config.secrets import values_without_secrets
 from flow.config.tree import Section, Tree, load_tree
 from flow.config_error import ConfigError, did_you_mean, one_of
 from flow.link import RUN_TOPICS, TRUTH_TOPICS, Source
@@ -48,8 +49,8 @@ class Graph:
     left_out: dict[str, str] = field(default_factory=dict[str, str])  # nodes, and what each needs
 
     def settings_yaml(self) -> str:
-        """The merged configuration as YAML text: includes, overlays and --set applied."""
-        return yaml.safe_dump(self.values, sort_keys=False, width=120)
+        """The merged configuration as YAML text: includes, overlays and --set applied, secrets in URLs replaced."""
+        return yaml.safe_dump(values_without_secrets(self.values), sort_keys=False, width=120)
 
     def left_out_texts(self) -> list[str]:
         """A text for each missing value: `the configuration has no $rig.cameras: vp_drone, align left out`."""
@@ -95,10 +96,19 @@ class Graph:
 
 
 def load_graph(
-    file: Path, overlays: Sequence[Path] = (), sets: Sequence[str] = (), sections: Mapping[str, Section] | None = None
+    file: Path,
+    overlays: Sequence[Path] = (),
+    sets: Sequence[str] = (),
+    sections: Mapping[str, Section] | None = None,
+    *,
+    packages: Collection[str] | None = None,
 ) -> Graph:
-    """Read, merge and check a configuration; arguments as in `load_tree`. ConfigError: all errors that it has."""
+    """Read, merge and check a configuration; arguments as in `load_tree`. ConfigError: all errors that it has.
+
+    `packages`: top-level packages from which it may name classes; None: any, the configuration is the user's own.
+    """
     tree = load_tree(file, overlays, sets, sections)
+    tree.packages = packages
     graph = check(tree, file)
     if tree.errors:
         raise ConfigError.in_order(tree.errors)

@@ -13,11 +13,11 @@ from pathlib import Path
 import pytest
 
 from links.dynamixel.wire import Health
+from links.lidar.position import Pps
+from links.lidar.reject_reason import PacketRejectReason
 from links.mavlink.poses.gate import RejectReason as GateRejectReason
 from links.recording import Recorder
 from links.recording.writer import CLOSE_TIMEOUT_S
-from links.velodyne.position import Pps
-from links.velodyne.reject_reason import PacketRejectReason
 from stages.messages import BranchState, PoseState, TrackingState
 from tests.links.fault_bounds import BOUNDS, FIRST_POSE_S, FIRST_POSITION_S, KILLED, MAX_RECORDING_LOSS_S, REST_S
 from tests.unit_file import unit_file
@@ -53,10 +53,10 @@ TEXTS = {  # source file and its texts
     "links/runs/live_run.py": ["cannot write to the terminal"],
     "links/runs/results.py": ["results are being lost"],
     "links/recording/recorder.py": ["nothing is recorded now"],
-    "links/velodyne/udp.py": ["cannot listen on UDP", "is the network interface still up?", "no packet on UDP"],
-    "links/velodyne/lidar.py": [
+    "links/lidar/udp.py": ["cannot listen on UDP", "is the network interface still up?", "no packet on UDP"],
+    "links/lidar/lidar.py": [
         "consecutive packets are invalid",
-        "these packets come from a Velodyne",
+        "these packets come from a",
         "the sensor's clock is not locked to UTC",
         "the sensor's clock lost its lock to UTC",
         "no position packet arrives on UDP",
@@ -108,7 +108,7 @@ TEXTS = {  # source file and its texts
     "links/viewer/viewer.py": ["not all is drawn", "not drawn"],
     "links/zenoh/connection.py": ["does not accept the connection", "has not replied for"],
     "links/zenoh/sender.py": ["does not subscribe to"],
-    "links/cli/run.py": ["rejected: "],
+    "links/cli/run_output.py": ["rejected: "],
 }
 
 

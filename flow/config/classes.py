@@ -1,19 +1,24 @@
 """The classes that a configuration may name, by kind: stages and links.
 
+A module is imported only when its source is known to define the class: importing one executes it.
+
 Source: ours.
 """
 
 from __future__ import annotations
 
+import ast
 import importlib
 import importlib.util
 import pkgutil
+import sys
 from collections.abc import Iterator
+from pathlib import Path
 from types import ModuleType
 from typing import Any, cast
 
 from flow.config.tree import KeyPath, Tree
-from flow.config_error import did_you_mean
+from flow.config_error import did_you_mean, one_of
 from flow.link import Link, Tap
 from flow.stage import Node, PortError, Stage, input_ports, output_ports
 
@@ -29,7 +34,11 @@ def named_class(tree: Tree, kind: str, path: KeyPath, use: Any) -> type[Node[Any
         tree.error(here, f"must name a class as module.Class, got {use!r}." if use is not None else "is missing.")
         return None
     module_name, _, class_name = use.rpartition(".")
-    if not all(part.isidentifier() for part in use.split(".")) or not _exists(module_name):
+    if tree.packages is not None and use.partition(".")[0] not in tree.packages:
+        allowed = one_of(f"{package}." for package in tree.packages)
+        tree.error(here, f"'{use}' is not of grd ({allowed}), so it is not imported; --trust if it is your own.")
+        return None
+    if not all(part.isidentifier() for part in use.split(".")) or not _defines(module_name, class_name):
         tree.error(here, f"unknown {node_kind} '{use}'.{did_you_mean(use, known_classes(kind))}")
         return None
     try:
@@ -56,11 +65,48 @@ def named_class(tree: Tree, kind: str, path: KeyPath, use: Any) -> type[Node[Any
     return None
 
 
-def _exists(module_name: str) -> bool:
-    try:
-        return importlib.util.find_spec(module_name) is not None
-    except (ImportError, ValueError):
+def _defines(module_name: str, name: str) -> bool:
+    """Whether a module binds a name at its top level, by its source, without importing it or its packages."""
+    if module_name in sys.modules:
+        return hasattr(sys.modules[module_name], name)
+    source = _source(module_name)
+    if source is None:
         return False
+    try:
+        body = ast.parse(source.read_bytes()).body
+    except (OSError, SyntaxError, ValueError):
+        return False
+    return any(name in names or "*" in names for names in map(_bound, body))
+
+
+def _source(module_name: str) -> Path | None:
+    """The source file of a module. `importlib.util.find_spec` would import the packages around it."""
+    top, *inner = module_name.split(".")
+    try:
+        spec = importlib.util.find_spec(top)
+    except (ImportError, ValueError):
+        return None
+    if spec is None:
+        return None
+    if not inner:
+        return Path(spec.origin) if spec.origin is not None and spec.origin.endswith(".py") else None
+    for folder in spec.submodule_search_locations or ():
+        path = Path(folder, *inner)
+        for file in (path / "__init__.py", path.with_suffix(".py")):
+            if file.is_file():
+                return file
+    return None
+
+
+def _bound(statement: ast.stmt) -> list[str]:
+    """Names that a statement of a module binds; `*`: not known."""
+    if isinstance(statement, ast.ClassDef):
+        return [statement.name]
+    if isinstance(statement, ast.Import | ast.ImportFrom):
+        return [alias.asname or alias.name for alias in statement.names]
+    if isinstance(statement, ast.Assign):
+        return [target.id for target in statement.targets if isinstance(target, ast.Name)]
+    return ["*"] if isinstance(statement, ast.If | ast.Try) else []
 
 
 def known_classes(kind: str) -> dict[str, type[Node[Any]]]:

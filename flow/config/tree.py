@@ -1,6 +1,7 @@
 """Configuration files as one tree that keeps where each value was written.
 
-- `include:` composes files: included files come first, the including file on top.
+- `include:` composes files: included files come first, the including file on top. A file is looked for next to the
+  including one, then among those that come with the program.
 - Overlay files and `--set track.radius_m=0.8` change values.
 - `$rig.lidar.mount` is replaced by another value of the tree. `$rig.cameras.drone.readout_ms or 0` is 0 where the tree
   has no such value.
@@ -8,26 +9,30 @@
 Mappings merge; everything else is replaced. `null` removes a stage or link. A stage whose `use` changes starts with an
 empty `config`. A lens whose `model` changes is replaced, because its numbers belong to the model.
 
-Source: ours. YAML 1.1 by PyYAML's safe loader: it constructs no objects, and sizes are bounded here.
+Source: ours. The bounds of a file are those of `yaml_text`; those of all references together are here.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
 
-import yaml
-
+from flow.config.yaml_text import (
+    MAX_DEPTH,
+    MAX_FILE_BYTES,
+    MAX_VALUES,
+    KeyPath,
+    YamlText,
+    YamlTextError,
+    read_yaml,
+    yaml_values,
+)
 from flow.config_error import ConfigError, ErrorDetail, Location, did_you_mean
 
-MAX_FILE_BYTES = 1_000_000
-MAX_VALUES = 100_000  # after aliases are expanded
-MAX_DEPTH = 40
-
-KeyPath = tuple[str, ...]
-Section = tuple[Any, Location]
+SHIPPED = Path(__file__).resolve().parents[2] / "configs"  # the configurations that come with the program
+Section = tuple[str, str]  # YAML text, and where it is from, for errors
 
 
 @dataclass
@@ -38,6 +43,8 @@ class Tree:
     locations: dict[KeyPath, Location] = field(default_factory=dict[KeyPath, Location])
     errors: list[ErrorDetail] = field(default_factory=list[ErrorDetail])
     root: Location = field(default_factory=lambda: Location("configuration", 0))
+    references_left: int = MAX_VALUES  # values that references may still expand to
+    packages: Collection[str] | None = None  # whose classes may be named; None: any
 
     def location(self, path: KeyPath) -> Location:
         """Where the value at `path`, or the nearest one above it, was written."""
@@ -55,15 +62,15 @@ def load_tree(
 ) -> Tree:
     """Read `file` with its includes, then merge `overlays` and `sets` ("track.radius_m=0.8") over it.
 
-    `sections` replace whole sections of the file itself, below the overlays: a recording has its own `rig`.
+    `sections` replace whole sections of the file itself, below the overlays: a recording has its own `rig`, as text.
 
     Errors of form are in `tree.errors`. ConfigError: the main file cannot be read at all.
     """
     tree = Tree(root=Location(str(file), 0))
     _merge(tree, _read(file, tree, ()))
-    for key, (value, location) in (sections or {}).items():
+    for key, (text, source) in (sections or {}).items():
         tree.values.pop(key, None)
-        _merge(tree, _tree_of({key: value}, location))
+        _merge(tree, _section(key, text, source))
     for path in overlays:
         _merge(tree, _read(path, tree, ()))
     for text in sets:
@@ -79,6 +86,12 @@ def resolve(tree: Tree, path: KeyPath, value: Any) -> Any:
 
 
 def _resolve(tree: Tree, path: KeyPath, value: Any, within: tuple[str, ...]) -> Any:
+    tree.references_left -= len(within) > 0
+    if tree.references_left <= 0:
+        if tree.references_left == 0:
+            tree.error(path, f"references expand to more than {MAX_VALUES} values.")
+            tree.references_left -= 1
+        return None
     if isinstance(value, dict):
         items = cast("dict[str, Any]", value)
         return {k: _resolve(tree, (*path, k), v, within) for k, v in items.items()}
@@ -88,6 +101,9 @@ def _resolve(tree: Tree, path: KeyPath, value: Any, within: tuple[str, ...]) -> 
         return value
     if value in within:
         tree.error(path, f"'{value}' refers to itself.")
+        return None
+    if len(within) > MAX_DEPTH:
+        tree.error(path, f"'{value}' refers through more than {MAX_DEPTH} others.")
         return None
     here: Any = tree.values
     named, _, default = value[1:].partition(" or ")
@@ -106,8 +122,8 @@ def _resolve(tree: Tree, path: KeyPath, value: Any, within: tuple[str, ...]) -> 
 def _scalar(tree: Tree, path: KeyPath, text: str) -> str | int | float | bool | None:
     """A plain value written after `or`."""
     try:
-        value = yaml.safe_load(text)
-    except yaml.YAMLError:
+        value = yaml_values(text)
+    except YamlTextError:
         value = ()
     if value is None or (isinstance(value, str | int | float | bool) and not text.startswith("$")):
         return value
@@ -131,26 +147,15 @@ def _read(file: Path, tree: Tree, including: tuple[Path, ...]) -> Tree:
         return failed(f"no such file.{near}")
     except OSError as error:
         return failed(f"cannot be read: {error.strerror}.")
-    if len(data) > MAX_FILE_BYTES:
-        return failed(f"larger than {MAX_FILE_BYTES} bytes: that is no configuration.")
     try:
-        node = _compose(data.decode("utf-8"))
-    except UnicodeDecodeError as error:
-        return failed(f"is not UTF-8 text (byte {error.start}).")
-    except yaml.MarkedYAMLError as error:
-        line = error.problem_mark.line + 1 if error.problem_mark else 0
-        return failed(f"is not YAML: {error.problem}.", line)
-    except (yaml.YAMLError, RecursionError) as error:
-        return failed(f"is not YAML: {str(error).splitlines()[0]}.")
-    if node is None:
+        text = read_yaml(data)
+    except YamlTextError as error:
+        return failed(str(error), error.line)
+    if text.values is None:
         return failed("is empty.")
-    if not isinstance(node, yaml.MappingNode):
+    if not isinstance(text.values, dict):
         return failed("must be a mapping with 'stages:' and 'links:' at the top.", 1)
-
-    try:
-        own.values = _plain(node, (), str(file), own, [MAX_VALUES])
-    except OverflowError as error:
-        return failed(str(error))
+    own = _tree_of_text(text, str(file))
     tree.errors += own.errors
     own.errors = []
 
@@ -163,6 +168,8 @@ def _read(file: Path, tree: Tree, including: tuple[Path, ...]) -> Tree:
             tree.errors.append(ErrorDetail(location, "include", text))
             continue
         target = file.parent / name
+        if not target.is_file() and (SHIPPED / name).is_file():
+            target = SHIPPED / name
         chain = (*including, file.resolve())
         if target.resolve() in chain:
             tree.errors.append(ErrorDetail(location, "include", f"'{name}' includes itself."))
@@ -175,47 +182,24 @@ def _read(file: Path, tree: Tree, including: tuple[Path, ...]) -> Tree:
     return below
 
 
-def _plain(node: yaml.Node, path: KeyPath, file: str, tree: Tree, budget: list[int]) -> Any:
-    """YAML nodes to plain values; locations and errors go to `tree`."""
-    budget[0] -= 1
-    if budget[0] < 0 or len(path) > MAX_DEPTH:
-        raise OverflowError("is too large or too deep: that is no configuration.")
-    location = Location(file, node.start_mark.line + 1)
-    tree.locations.setdefault(path, location)
-    if isinstance(node, yaml.SequenceNode):
-        items = cast("list[yaml.Node]", node.value)
-        return [_plain(item, (*path, str(i)), file, tree, budget) for i, item in enumerate(items)]
-    if isinstance(node, yaml.MappingNode):
-        result: dict[str, Any] = {}
-        for key_node, value_node in cast("list[tuple[yaml.Node, yaml.Node]]", node.value):
-            key = str(key_node.value) if isinstance(key_node, yaml.ScalarNode) else "?"
-            here = Location(file, key_node.start_mark.line + 1)
-            if not isinstance(key_node, yaml.ScalarNode) or key_node.tag == "tag:yaml.org,2002:merge":
-                tree.error(path, "a key must be a plain word.", here)
-                continue
-            if key in result:
-                tree.error((*path, key), f"is written twice (first on line {tree.locations[(*path, key)].line}).", here)
-                continue
-            tree.locations[(*path, key)] = here
-            result[key] = _plain(value_node, (*path, key), file, tree, budget)
-        return result
+def _tree_of_text(text: YamlText, file: str, above: KeyPath = ()) -> Tree:
+    """The tree of a text whose top is the value at `above`."""
+    tree = Tree(values=text.values, root=Location(file, 0))
+    for key in reversed(above):
+        tree.values = {key: tree.values}
+    tree.locations = {(*above, *path): Location(file, line) for path, line in text.lines.items()}
+    tree.errors = [
+        ErrorDetail(Location(file, line), ".".join((*above, *path)), error) for path, error, line in text.errors
+    ]
+    return tree
+
+
+def _section(key: str, text: str, source: str) -> Tree:
+    """The tree of one section that is a text of its own."""
     try:
-        return _construct(node)
-    except (yaml.YAMLError, ValueError) as error:
-        tree.error(path, f"has a value that cannot be read: {str(error).splitlines()[0]}.", location)
-        return None
-
-
-def _compose(text: str) -> yaml.Node | None:
-    return cast("yaml.Node | None", yaml.compose(text, Loader=yaml.SafeLoader))  # pyright: ignore[reportUnknownMemberType]
-
-
-def _construct(node: yaml.Node) -> Any:
-    loader = yaml.SafeLoader("")
-    try:
-        return cast(Any, loader.construct_object(node, deep=True))  # pyright: ignore[reportUnknownMemberType]
-    finally:
-        loader.dispose()  # pyright: ignore[reportUnknownMemberType]
+        return _tree_of_text(read_yaml(text), source, (key,))
+    except YamlTextError as error:
+        return Tree(errors=[ErrorDetail(Location(source, error.line), key, str(error))])
 
 
 def _tree_of(values: dict[str, Any], location: Location) -> Tree:
@@ -265,14 +249,18 @@ def _merge_mapping(base: Tree, top: Tree, path: KeyPath, below: dict[str, Any], 
 
 
 def _set(tree: Tree, text: str) -> None:
-    """Apply `track.radius_m=0.8`: a stage's or link's name and a setting, or a whole path (`rig.drone.span_m=0.35`)."""
+    """Apply `track.radius_m=0.8`: a stage's or link's name and a setting, or a whole path (`rig.drone.span_m=0.35`).
+
+    In a file without stages and links, such as a scenario, every key is a whole path.
+    """
     location = Location(f"--set {text}", 0)
     key, equals, raw = text.partition("=")
     parts = tuple(key.strip().split("."))
-    if not equals or len(parts) < 2 or not all(parts):
+    of_graph = bool(tree.values.keys() & {"stages", "links"})
+    if not equals or len(parts) < 1 + of_graph or not all(parts):
         tree.error((), "must read NAME.SETTING=VALUE, as in --set track.radius_m=0.8.", location)
         return
-    if parts[0] not in ("stages", "links", "rig"):
+    if of_graph and parts[0] not in ("stages", "links", "rig"):
         kinds = [kind for kind in ("stages", "links") if parts[0] in (tree.values.get(kind) or {})]
         if not kinds:
             names: list[str] = [*(tree.values.get("stages") or {}), *(tree.values.get("links") or {}), "rig"]
@@ -280,9 +268,9 @@ def _set(tree: Tree, text: str) -> None:
             return
         parts = (kinds[0], parts[0], "config", *parts[1:])
     try:
-        value = yaml.safe_load(raw)
-    except yaml.YAMLError as error:
-        tree.error((), f"the value is not YAML: {str(error).splitlines()[0]}.", location)
+        value = yaml_values(raw)
+    except YamlTextError as error:
+        tree.error((), f"the value {error}", location)
         return
     for part in reversed(parts):
         value = {part: value}

@@ -178,5 +178,6 @@ class Live:
             failures={name: count for name, count in failures.items() if count},
             switched_off=[name for name, stage in stages.items() if stage.switched_off],
             tap_drops={tap.node: sum(tap.inbox.dropped) for tap in threads.taps},
+            statuses={name: status for name, status in self._statuses.copy().items() if status},
             events=self.events.all,
         )

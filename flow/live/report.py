@@ -83,6 +83,7 @@ class LiveReport(RunReport):
     failures: dict[str, int] = field(default_factory=dict[str, int])
     switched_off: list[str] = field(default_factory=list[str])  # stages that raised too often
     tap_drops: dict[str, int] = field(default_factory=dict[str, int])
+    statuses: dict[str, str] = field(default_factory=dict[str, str])  # what does not work now, by link
 
     @property
     def dropped(self) -> int:

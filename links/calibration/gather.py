@@ -11,22 +11,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
+from flow.config.yaml_text import yaml_values
 from flow.link import LinkError, Record
 from links.dynamixel import Servo
 from links.dynamixel.servo import TICK_RAD
+from links.lidar import Lidar, recorded_lidars, rig_unit
 from links.recording import Progress, Session
 from links.vehicle_odometry import VehicleOdometry
-from links.velodyne import Lidar, recorded_lidars
 from stages.calibration.scan_passes import Returns, ServoTrace
 from stages.geometry.frames import LidarMount
+from stages.geometry.rig_lidar import RigLidar
 from stages.messages import LidarFirings
 
 MOST_RETURNS = 300_000  # more add seconds and no accuracy: firing sequences are left out evenly
-LASERS = 16
 Array = NDArray[Any]
 MIN_RANGE_M = 1.0  # nearer returns are the sensor's own mount and the roof's edge
 
@@ -70,7 +69,8 @@ def gather(
             if record.arrival_ns >= begin_ns:
                 yield record
 
-    lidar = lidar_of(session.config_yaml)
+    rig, unit = checked_rig(text, str(recording if rig_yaml is None else "--rig"))
+    lidar = lidar_of(session.config_yaml, unit)
     good = 0
     ends_ns: list[int] = []  # of the first packet and of the last
     servo_stamps_ns: list[int] = []
@@ -88,7 +88,6 @@ def gather(
         elif (motion := odometry.decode(record)) is not None:
             start_m = motion.xyz_map_m if start_m is None else start_m
             driven_m = max(driven_m or 0.0, float(np.linalg.norm(motion.xyz_map_m - start_m)))
-    rig, mount = checked_rig(text, str(recording if rig_yaml is None else "--rig"))
     if not ends_ns:
         raise LinkError(f"{recording} holds no LiDAR packets in that time: is it the right recording, and the part?")
     if not servo_rad:
@@ -98,23 +97,23 @@ def gather(
         )
     trace = ServoTrace.of(np.array(servo_stamps_ns), np.array(servo_rad), TICK_RAD)
     seconds = (ends_ns[-1] - ends_ns[0]) * 1e-9
-    again = lidar_of(session.config_yaml)
+    again = lidar_of(session.config_yaml, unit)
     packets = (packet for record in between([again.topic], half=1) if (packet := again.decode(record)) is not None)
-    returns = returns_of(packets, step=max(-(-good // MOST_RETURNS), 1))
-    return Gathered(returns, trace, rig, mount, driven_m, seconds, len(session.parts), session.warnings)
+    returns = returns_of(packets, again.form.profile.lasers, step=max(-(-good // MOST_RETURNS), 1))
+    return Gathered(returns, trace, rig, unit.mount, driven_m, seconds, len(session.parts), session.warnings)
 
 
-def lidar_of(config_yaml: str | None) -> Lidar:
+def lidar_of(config_yaml: str | None, unit: RigLidar) -> Lidar:
     """The LiDAR with its clock as the recorded run had it: another would move all its pulses against the servo.
 
     Free, a sensor's clock is set by the packets that come soonest: late by the shortest way, in the simulated rig 2 ms.
     """
     config = next(reversed(recorded_lidars(config_yaml)), {})
     clock = {name: config[name] for name in ("clock", "clock_limit_s") if name in config}
-    return Lidar(**clock)
+    return Lidar(unit=unit, **clock)
 
 
-def returns_of(packets: Iterable[LidarFirings], step: int) -> Returns:
+def returns_of(packets: Iterable[LidarFirings], lasers_of_model: int, step: int) -> Returns:
     """Returns beyond MIN_RANGE_M of every step-th firing sequence: every laser stays."""
     before = 0
     stamps: list[Array] = []
@@ -122,7 +121,7 @@ def returns_of(packets: Iterable[LidarFirings], step: int) -> Returns:
     points: list[Array] = []
     for packet in packets:
         good = packet.range_m > MIN_RANGE_M
-        sequence = (before + np.arange(len(good))) // LASERS
+        sequence = (before + np.arange(len(good))) // lasers_of_model
         before += len(good)
         kept = np.nonzero(good & (sequence % step == 0) & (packet.return_kind == 0))[0]
         stamps.append(packet.pulse_stamp_ns[kept])
@@ -132,17 +131,11 @@ def returns_of(packets: Iterable[LidarFirings], step: int) -> Returns:
         stamp_ns=np.concatenate(stamps),
         laser=np.concatenate(lasers),
         xyz_lidar_m=np.concatenate(points).astype(np.float64),
+        lasers=lasers_of_model,
     )
 
 
-def checked_rig(text: str, where: str) -> tuple[dict[str, object], LidarMount]:
-    """A rig file's tree and its LiDAR's mount. LinkError says what is wrong with it."""
-    try:
-        rig = yaml.safe_load(text)
-        return rig, LidarMount.model_validate(rig["lidar"]["mount"])
-    except (yaml.YAMLError, KeyError, TypeError) as error:
-        raise LinkError(f"{where}: the rig cannot be read: {str(error).splitlines()[0]}") from None
-    except ValidationError as errors:
-        first = errors.errors(include_url=False)[0]
-        at = ".".join(str(part) for part in ("lidar", "mount", *first["loc"]))
-        raise LinkError(f"{where}: the rig's {at}: {first['msg']}") from None
+def checked_rig(text: str, where: str) -> tuple[dict[str, object], RigLidar]:
+    """A rig file's tree and its LiDAR. LinkError says what is wrong with it."""
+    unit = rig_unit(text, where)
+    return yaml_values(text), unit

@@ -31,6 +31,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from flow.config.secrets import without_secrets
 from links.camera.image_clock import ImageClock
 
 WAITED_SHARE = 0.25  # of the frame period: after a shorter grab the frame counts as buffered
@@ -82,11 +83,6 @@ def is_device(source: str) -> bool:
     return source.startswith("/dev/")
 
 
-def without_password(source: str) -> str:
-    """A source without the name and password in its URL, for messages."""
-    return re.sub(r"(?<=://)[^/@]*@", "", source)
-
-
 class Capture:
     """An open source; `read` returns frame after frame. Raises CaptureLost when it cannot be opened, or is lost."""
 
@@ -94,7 +90,7 @@ class Capture:
         """`counters`: of dropped frames, by reason: "stale" (buffered), "late", "damaged"."""
         self._settings, self._now_ns, self._counters = settings, now_ns, counters
         self._live = is_device(settings.source) or is_url(settings.source)
-        self._name = without_password(settings.source)
+        self._name = without_secrets(settings.source)
         self._video, self._raw = self._open()
         self._opened_ns = now_ns()
         share = WAITED_SHARE if self._raw or is_device(settings.source) else DECODED_SHARE

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from flow.config.secrets import without_secrets
 from flow.link import LinkError
 from links.camera.capture import (
     Capture,
@@ -16,7 +17,6 @@ from links.camera.capture import (
     Frame,
     is_device,
     is_url,
-    without_password,
 )
 from links.clock import host_time
 
@@ -108,6 +108,6 @@ class LiveCamera:
                 "user in the group video, and does another program use it (`fuser -v /dev/video0`)?"
             )
         if is_url(source):
-            command = f"ffplay {without_password(source)}"
+            command = f"ffplay {without_secrets(source)}"
             return f"Does another player open it (`{command}`)? Check address, port, name and password."
         return "Is `source` the path of a video file that FFmpeg reads, or did you mean /dev/video0 or a URL?"

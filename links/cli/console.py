@@ -6,6 +6,7 @@ Source: ours.
 from __future__ import annotations
 
 import functools
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -22,7 +23,7 @@ from flow.link import LinkError
 from flow.ports import RunError
 
 EXIT_FAILED, EXIT_USAGE = 1, 2
-BAR_DELAY_S = 1.0
+BAR_DELAY_S, LINE_PERIOD_S = 1.0, 10.0
 UNBOUNDED_WIDTH = 100_000  # columns
 
 out = Console(highlight=False, soft_wrap=True)
@@ -62,13 +63,22 @@ def report_errors(command: F) -> F:
 
 
 @contextmanager
-def progress_bar(label: str) -> Iterator[Callable[[float, float], None]]:
-    """`with progress_bar("replay") as step: step(done, total)`: a bar on stderr, shown after BAR_DELAY_S."""
+def progress_bar(label: str, *, at_once: bool = False) -> Iterator[Callable[[float, float], None]]:
+    """`with progress_bar("replay") as step: step(done, total)`: a bar on stderr, shown after BAR_DELAY_S.
+
+    `at_once`: shown from the start, also in a log: a line now and every LINE_PERIOD_S, however long a step takes.
+    """
+    if at_once and not err.is_terminal:
+        with _progress_lines(label) as line_step:
+            yield line_step
+        return
     begin = time.monotonic()
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
     bar = Progress(*columns, console=err, transient=True, refresh_per_second=5)
     task = bar.add_task(label, total=None)
-    shown = False
+    shown = at_once
+    if at_once:
+        bar.start()
 
     def step(done: float, total: float) -> None:
         nonlocal shown
@@ -84,6 +94,30 @@ def progress_bar(label: str) -> Iterator[Callable[[float, float], None]]:
     finally:
         if shown:
             bar.stop()
+
+
+@contextmanager
+def _progress_lines(label: str) -> Iterator[Callable[[float, float], None]]:
+    """Progress as lines of a log."""
+    begin_s, ended, share = time.monotonic(), threading.Event(), [0.0]
+
+    def show() -> None:
+        while True:
+            percent = f", {100 * share[0]:.0f} %" if share[0] else ""
+            err.print(f"{label}: {time.monotonic() - begin_s:.0f} s{percent}", markup=False)
+            if ended.wait(LINE_PERIOD_S):
+                return
+
+    def step(done: float, total: float) -> None:
+        share[0] = done / total if total else 0.0
+
+    thread = threading.Thread(target=show, name="progress", daemon=True)
+    thread.start()
+    try:
+        yield step
+    finally:
+        ended.set()
+        thread.join()
 
 
 def warn(text: str) -> None:

@@ -5,31 +5,44 @@ Source: DESIGN, Command line.
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 import yaml
 from pydantic import ValidationError
 
+from flow.config.yaml_text import YamlTextError, yaml_values
 from flow.link import LinkError
 from links.cli.console import EXIT_FAILED, err, out, progress_bar, report_errors, warn
 from stages.geometry.frames import LidarMount
 
 MAX_RIG_BYTES = 100_000
+BEAM_FILES = (".json", ".csv")  # an Ouster's metadata, a Hesai XT's angle correction
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing output file.")]
 
 
 @report_errors
 def import_recording(
-    file: Annotated[Path, typer.Argument(help="A VLP-16 capture (.pcap) or a MAVLink log (.tlog).")],
+    file: Annotated[
+        Path,
+        typer.Argument(
+            help="A LiDAR's capture (.pcap), a MAVLink log (.tlog), or the beams of one LiDAR (.json, .csv)."
+        ),
+    ],
     out_file: Annotated[
         Path | None, typer.Option("--out", "-o", help="Recording to write [default: next to FILE].")
     ] = None,
     rig: Annotated[
-        Path | None, typer.Option("--rig", help="rig.yaml to attach [default for .pcap: bolted upright].")
+        Path | None,
+        typer.Option(
+            "--rig", help="rig.yaml to attach, or an Ouster's metadata .json [default for .pcap: bolted upright]."
+        ),
     ] = None,
-    port: Annotated[int, typer.Option("--port", help="UDP port of the LiDAR's data packets in the capture.")] = 2368,
+    port: Annotated[
+        int | None, typer.Option("--port", help="UDP port of the LiDAR's data packets [default: the model's].")
+    ] = None,
     sender: Annotated[
         str | None, typer.Option("--sender", help="IPv4 address of the LiDAR, if there are several.")
     ] = None,
@@ -37,11 +50,17 @@ def import_recording(
 ) -> None:
     """Convert a capture or a telemetry log to a recording.
 
+    An Ouster's metadata (.json) or the angle correction file of a Hesai XT (.csv) becomes a rig file with its model and
+    its beams, to be included after your rig.
+
     Example: grd import flight.pcap -o flight.mcap --rig configs/rigs/standard.yaml
     """
     from links.recording import import_file
 
-    rig_yaml = read_rig(rig) if rig is not None else None
+    if file.suffix in BEAM_FILES:
+        _import_beams(file, out_file, overwrite)
+        return
+    rig_yaml = None if rig is None else _upright_rig(rig) if rig.suffix in BEAM_FILES else read_rig(rig)
     with progress_bar(f"import {file.name}") as step:
         report = import_file(
             file, out_file, rig_yaml=rig_yaml, port=port, sender=sender, overwrite=overwrite, progress=step
@@ -54,6 +73,41 @@ def import_recording(
     out.print(f"{report.path}: {topics}", markup=False)
 
 
+def _import_beams(file: Path, out_file: Path | None, overwrite: bool) -> None:
+    """Write the model and the beams in a manufacturer's file as a rig file."""
+    lidar = _lidar_of(file)
+    target = out_file or file.with_suffix(".yaml")
+    if target.exists() and not overwrite:
+        raise LinkError(f"{target} exists already: give another name with -o, or --overwrite")
+    target.write_text(
+        yaml.safe_dump({"rig": {"lidar": lidar}}, sort_keys=False, default_flow_style=None, width=120), encoding="utf-8"
+    )
+    out.print(f"{target}: {lidar['model']}, {len(lidar['beams']['elevation_deg'])} beams", markup=False)
+
+
+def _upright_rig(file: Path) -> str:
+    """The rig of a capture without a known mount, with the beams in a manufacturer's file."""
+    from links.recording.importing import DEFAULT_RIG
+
+    lidar = _lidar_of(file)
+    rig = yaml.safe_load(DEFAULT_RIG.format(model=lidar["model"]))
+    rig["lidar"] |= lidar
+    return yaml.safe_dump(rig, sort_keys=False, default_flow_style=None, width=120)
+
+
+def _lidar_of(file: Path) -> dict[str, Any]:
+    """Model and beams in a manufacturer's file. LinkError if it is none."""
+    from links.lidar import hesai_beams, ouster_beams
+
+    text = file.read_text(encoding="utf-8", errors="replace")
+    if file.suffix == ".json":
+        model, beams = ouster_beams(text, str(file))
+    else:
+        beams = hesai_beams(text, str(file))
+        model = f"XT{len(beams.elevation_deg)}"
+    return {"model": model, "beams": beams.model_dump(mode="json")}
+
+
 def read_rig(file: Path) -> str:
     """Text of a rig file, or of the `rig:` section of a configuration, as recordings store it.
 
@@ -62,9 +116,9 @@ def read_rig(file: Path) -> str:
     with file.open("rb") as stream:
         data = stream.read(MAX_RIG_BYTES + 1)
     try:
-        tree = yaml.safe_load(data.decode("utf-8")) if len(data) <= MAX_RIG_BYTES else None
-    except (UnicodeDecodeError, yaml.YAMLError) as error:
-        raise LinkError(f"{file} is no rig: {str(error).splitlines()[0]}") from None
+        tree = yaml_values(data) if len(data) <= MAX_RIG_BYTES else None
+    except YamlTextError as error:
+        raise LinkError(f"{file} is no rig: {error}") from None
     rig = tree.get("rig", tree) if isinstance(tree, dict) else None
     if not isinstance(rig, dict) or "lidar" not in rig:
         raise LinkError(f"{file} is no rig: it needs 'lidar:' with 'mount:' as configs/rigs/standard.yaml has")
@@ -104,6 +158,12 @@ def recover_recording(
         raise typer.Exit(EXIT_FAILED)
 
 
+def _size(text: str) -> str:
+    if not re.fullmatch(r"[1-9]\d{1,4}x[1-9]\d{1,4}", text):
+        raise typer.BadParameter(f"{text} is not WIDTHxHEIGHT in pixels, as 1920x1080 is.")
+    return text
+
+
 @report_errors
 def view(
     rrd: Annotated[Path, typer.Argument(help="The run.rrd of a run.")],
@@ -112,6 +172,10 @@ def view(
         typer.Option("--screenshot", help="Write an image instead of opening a window (no display needed)."),
     ] = None,
     at: Annotated[float, typer.Option("--at", min=0, max=1, help="Time of the image, as a fraction of the run.")] = 0.9,
+    tab: Annotated[str | None, typer.Option("--tab", help="Tab in the image [default: Overview].")] = None,
+    size: Annotated[
+        str, typer.Option("--size", metavar="WxH", callback=_size, help="Size of the image [px].")
+    ] = "1920x1080",
 ) -> None:
     """Open a run in the Rerun viewer, or write a screenshot of it.
 
@@ -122,9 +186,11 @@ def view(
     from links.viewer import screenshot, show
 
     if png is None:
+        if tab is not None:
+            raise LinkError("--tab selects the tab of an image: add --screenshot FILE.png")
         show(rrd)
         return
-    errors = screenshot(rrd, png, at=at)
+    errors = screenshot(rrd, png, at=at, tab=tab, size=size)
     for text in errors:
         err.print(text, markup=False, style="red")
     out.print(f"wrote {png}", markup=False)

@@ -18,11 +18,11 @@ from flow.config.hosts_file import load_hosts
 from flow.config.schema import schema as schema_of
 from flow.config_error import ConfigError
 from flow.graph import Graph, load_graph
-from links.cli.console import EXIT_FAILED, EXIT_USAGE, err, out, report_errors
-from links.cli.run import Overlay, Sets
+from links.cli.console import EXIT_FAILED, EXIT_USAGE, err, out, report_errors, warn
+from links.cli.run import Config, Overlay, Sets
+from links.runs.shipped_values import shipped_values
 from links.zenoh import host_graph
 
-Config = Annotated[Path, typer.Argument(help="Configuration file.")]
 OutFile = Annotated[Path | None, typer.Option("--out", "-o", help="File to write [default: the terminal].")]
 HostsFile = Annotated[Path | None, typer.Option("--hosts", help="A hosts file: which host runs what.")]
 
@@ -38,7 +38,8 @@ class Format(StrEnum):
 def check(config: Config, overlay: Overlay = None, sets: Sets = None, hosts: HostsFile = None) -> None:
     """Report all errors of CONFIG and of the hosts file.
 
-    Each error has its line and a suggestion; the exit code is 1 when there is one.
+    Each error has its line and a suggestion; the exit code is 1 when there is one. Warnings name settings of a live
+    configuration that depend on your vehicle and still have the value that comes with grd.
 
     Example: grd check configs/paper.yaml --set track.radius_m=0.8
     """
@@ -53,6 +54,8 @@ def check(config: Config, overlay: Overlay = None, sets: Sets = None, hosts: Hos
     out.print(f"{config}: {stages} stages, {len(graph.nodes) - stages} links, {len(graph.edges)} edges, no problems")
     for text in graph.left_out_texts():
         out.print(text, markup=False)
+    for text in shipped_values(graph):
+        warn(text)
     if placed is not None:
         _print_hosts(placed)
 

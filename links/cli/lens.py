@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 import yaml
 
+from flow.config.yaml_text import YamlTextError, yaml_values
 from flow.link import LinkError
 from links.cli.console import out, report_errors
 from links.cli.files import Overwrite
@@ -81,13 +82,14 @@ def read_lens(file: Path, camera: str, max_off_axis_deg: float | None) -> Calibr
         if len(data) > MAX_BYTES:
             raise LensFileError(f"larger than {MAX_BYTES} bytes: that is no calibration")
         if file.suffix in (".yaml", ".yml"):
+            yaml_values(data)  # bounds what `lens_from_kalibr` expands
             return lens_from_kalibr(data.decode("utf-8"), camera, **limit)
         if file.suffix == ".txt":
             return lens_from_ocamcalib(data.decode("utf-8"), **limit)
         raise LensFileError("neither Kalibr's .yaml nor OCamCalib's .txt")
     except UnicodeDecodeError as error:
         raise LinkError(f"{file}: is not UTF-8 text (byte {error.start})") from None
-    except LensFileError as error:
+    except (LensFileError, YamlTextError) as error:
         raise LinkError(f"{file}:{error.line}: {error}" if error.line else f"{file}: {error}") from None
 
 

@@ -1,4 +1,7 @@
-"""Console display of a live run: a table on a terminal, a line every few seconds otherwise (a log file, systemd).
+"""Console display of a live run: one screen of a terminal, a line every few seconds otherwise (a log file, systemd).
+
+The screen fits 24 rows: state and pose, what is sent to the autopilot, each source with its rate, age and status, the
+edges that drop messages or are late, what stages reject, and the newest events.
 
 Source: ours.
 """
@@ -6,11 +9,13 @@ Source: ours.
 from __future__ import annotations
 
 import time
+from collections import deque
+from collections.abc import Mapping
 from types import TracebackType
 from typing import Any
 
 import numpy as np
-from rich.console import Console, Group
+from rich.console import Console, Group, RenderableType
 from rich.live import Live as Screen
 from rich.table import Table
 from rich.text import Text
@@ -23,6 +28,10 @@ from links.runs.live_run import RunStatus
 from stages.messages import DroneFix, PositionEstimate, RelativePose, TrackState
 
 SCREEN_PERIOD_S, LINE_PERIOD_S = 0.25, 5.0
+RATE_S = 1.0  # rates are averages over this time at least
+MAX_EDGES, MAX_OTHERS, MAX_EVENTS = 3, 2, 3  # rows of the screen
+HELD_BACK, SENT = "pose rejected", "sent: "  # counters of the autopilot's link
+POSE_MESSAGES = ("ODOMETRY", "VISION_POSITION_ESTIMATE", "LANDING_TARGET")
 SHOWN = (RelativePose, DroneFix, TrackState)
 
 
@@ -68,6 +77,30 @@ def _position(xyz_m: Any, covariance_m2: Any) -> str:
     return f"x {x:.2f}  y {y:.2f}  z {z:.2f} m  sigma {float(np.trace(covariance_m2)) ** 0.5:.2f} m"
 
 
+class Rates:
+    """Rate and age of the records of each source, from their counts."""
+
+    def __init__(self) -> None:
+        self._last: dict[str, tuple[float, int]] = {}  # time and count at the start of the measured time
+        self._rates: dict[str, float] = {}
+        self._changed: dict[str, tuple[float, int]] = {}  # time of the newest change, and the count then
+
+    def add(self, now_s: float, counts: Mapping[str, int]) -> None:
+        """Take the counts at a time [s]."""
+        for name, count in counts.items():
+            since_s, before = self._last.setdefault(name, (now_s, count))
+            if now_s - since_s >= RATE_S:
+                self._rates[name] = (count - before) / (now_s - since_s)
+                self._last[name] = now_s, count
+            if count != self._changed.get(name, (0.0, 0))[1]:
+                self._changed[name] = now_s, count
+
+    def texts(self, now_s: float, name: str) -> tuple[str, str]:
+        """Rate [Hz] and time since the newest record [s]; empty while not known."""
+        rate_hz, changed = self._rates.get(name), self._changed.get(name)
+        return "" if rate_hz is None else f"{rate_hz:.1f}", "" if changed is None else f"{now_s - changed[0]:.1f}"
+
+
 class LiveView:
     """`with LiveView() as view`: `view.latest` is a tap of the run, `view.show` displays its status."""
 
@@ -76,6 +109,8 @@ class LiveView:
         self._console = console
         self._screen = Screen(console=console, auto_refresh=False, transient=True) if console.is_terminal else None
         self._next_s = 0.0
+        self._rates = Rates()
+        self._events: deque[str] = deque(maxlen=MAX_EVENTS)
 
     def __enter__(self) -> LiveView:
         if self._screen is not None:
@@ -90,14 +125,16 @@ class LiveView:
 
     def show(self, status: RunStatus) -> None:
         """Print new events at once; the status every SCREEN_PERIOD_S on a terminal, otherwise every LINE_PERIOD_S."""
-        for text in status.new_events:
-            (self._console if self._screen is not None else err).print(text, markup=False, style="yellow")
         now_s = time.monotonic()
+        for text in status.new_events:
+            self._events.append(f"{status.elapsed_s:.1f} s  {text}")
+            if self._screen is None:
+                err.print(text, markup=False, style="yellow")
         if now_s < self._next_s:
             return
         if self._screen is not None:
             self._next_s = now_s + SCREEN_PERIOD_S
-            self._screen.update(self._table(status), refresh=True)
+            self._screen.update(self._table(status, now_s), refresh=True)
         else:
             self._next_s = now_s + LINE_PERIOD_S
             self._console.print(self._line(status), markup=False)
@@ -109,29 +146,70 @@ class LiveView:
         parts = [f"{status.elapsed_s:.1f} s", state, pose, _numbers(report), *closed]
         return "; ".join(part for part in parts if part)
 
-    def _table(self, status: RunStatus) -> Group:
+    def _table(self, status: RunStatus, now_s: float) -> Group:
         report = status.report()
+        self._rates.add(now_s, {name: link.records for name, link in report.links.items()})
         state, pose = self.latest.state_and_pose()
-        head = Text(f"{status.elapsed_s:8.1f} s   {state}\n             {pose}\n             {_numbers(report)}")
-        edges = Table("edge", "from", box=None, pad_edge=False)
-        for name in ("lag [ms]", "p99", "max", "taken", "dropped", "late"):
-            edges.add_column(Text(name), justify="right")
-        for name, edge in report.edges.items():
-            bad = "red" if edge.dropped or edge.missed else None
-            numbers = [f"{edge.lag_ms:.1f}", f"{edge.lag_p99_ms:.1f}", f"{edge.lag_max_ms:.0f}"]
-            counts = [str(edge.taken), str(edge.dropped), str(edge.missed)]
-            edges.add_row(name, edge.source, *numbers, *counts, style=bad)
-        links = Table("link", "records", "state", box=None, pad_edge=False)
+        numbers = "; ".join(text for text in (_numbers(report), status.used) if text)
+        lines = [f"{status.elapsed_s:8.1f} s   {state}", f"             {pose or 'no position'}"]
+        lines += [f"             {sent}"] if (sent := _to_autopilot(report)) else []
+        parts: list[RenderableType] = [Text(line, no_wrap=True) for line in [*lines, f"             {numbers}"]]
+        parts += [self._sources(report, now_s), *_edges(report)]
+        others = [
+            Text(f"{name}: {_counts(counts)}", overflow="ellipsis", no_wrap=True)
+            for name, counts in report.counters.items()
+            if name not in report.links and any(counts.values())
+        ]
+        events = [Text(text, style="yellow", overflow="ellipsis", no_wrap=True) for text in self._events]
+        return Group(*parts, *others[:MAX_OTHERS], *events)
+
+    def _sources(self, report: LiveReport, now_s: float) -> Table:
+        table = Table("source", box=None, pad_edge=False)
+        for name in ("rate [Hz]", "age [s]", "records"):
+            table.add_column(Text(name), justify="right")
+        table.add_column("status")
         for name, link in report.links.items():
-            counts = ", ".join(f"{key} {value}" for key, value in report.counters.get(name, {}).items() if value)
-            links.add_row(
-                name, str(link.records), Text(f"{link.state_text}  {counts}", overflow="ellipsis", no_wrap=True)
-            )
-        others = Table("others", "counts", box=None, pad_edge=False)
-        for name, counted in report.counters.items():
-            if name not in report.links and any(counted.values()):
-                others.add_row(name, ", ".join(f"{key} {value}" for key, value in counted.items() if value))
-        return Group(head, edges, links, others) if others.row_count else Group(head, edges, links)
+            status = report.statuses.get(name)
+            text = status or link.state_text
+            bad = status is not None or link.state is not LinkState.OPEN
+            known = Text(f"{text}  {_counts(report.counters.get(name, {}))}", overflow="ellipsis", no_wrap=True)
+            style = "red" if bad else None
+            table.add_row(name, *self._rates.texts(now_s, name), str(link.records), known, style=style)
+        for name, status in report.statuses.items():
+            if name not in report.links:
+                table.add_row(name, "", "", "", Text(status, overflow="ellipsis", no_wrap=True), style="red")
+        return table
+
+
+def _edges(report: LiveReport) -> list[RenderableType]:
+    """The edges that drop messages or are late, the worst first; nothing when there is none."""
+    worst = sorted(report.edges.items(), key=lambda item: -(item[1].dropped + item[1].missed))
+    bad = [(name, edge) for name, edge in worst if edge.dropped or edge.missed]
+    if not bad:
+        return []
+    more = f"  (and {len(bad) - MAX_EDGES} more)" if len(bad) > MAX_EDGES else ""
+    table = Table(f"edge{more}", "from", box=None, pad_edge=False)
+    for name in ("lag [ms]", "p99", "max", "taken", "dropped", "late"):
+        table.add_column(Text(name), justify="right")
+    for name, edge in bad[:MAX_EDGES]:
+        numbers = [f"{edge.lag_ms:.1f}", f"{edge.lag_p99_ms:.1f}", f"{edge.lag_max_ms:.0f}"]
+        counts = [str(edge.taken), str(edge.dropped), str(edge.missed)]
+        table.add_row(name, edge.source, *numbers, *counts, style="red")
+    return [table]
+
+
+def _to_autopilot(report: LiveReport) -> str:
+    """How many poses were sent to the autopilot, and how many held back, by reason; empty without an autopilot."""
+    for counts in report.counters.values():
+        sent = {kind: counts[SENT + kind] for kind in POSE_MESSAGES if SENT + kind in counts}
+        rejected = {name.partition(": ")[2] or name: n for name, n in counts.items() if name.startswith(HELD_BACK)}
+        if sent or rejected:
+            return f"to the autopilot: {_counts(sent) or 'nothing sent'}; held back: {_counts(rejected) or 'none'}"
+    return ""
+
+
+def _counts(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{key} {value}" for key, value in counts.items() if value)
 
 
 def _numbers(report: LiveReport) -> str:

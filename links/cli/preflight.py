@@ -13,7 +13,7 @@ from rich.text import Text
 
 from flow.link import LinkError
 from links.cli.console import EXIT_FAILED, err, out, progress_bar, report_errors, warn
-from links.cli.run import Overlay, Sets
+from links.cli.run import Config, Overlay, Sets
 from links.preflight.check_result import CheckResult, Level, is_go
 from links.preflight.hand_motion import HandMotion
 from links.preflight.preflight import OUT_DIR, preflight_live, preflight_recording
@@ -27,7 +27,7 @@ LABELS = {Level.OK: "ok", Level.WARNING: "warn", Level.FAIL: "NO GO"}
 
 @report_errors
 def preflight(
-    config: Annotated[Path, typer.Argument(help="The configuration to fly with, as configs/field.yaml.")],
+    config: Config,
     overlay: Overlay = None,
     sets: Sets = None,
     recording: Annotated[

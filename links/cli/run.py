@@ -9,28 +9,34 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.table import Table
-from rich.text import Text
 
 from flow.graph import recording_named
 from flow.link import LinkError
 from flow.live.report import LiveReport
-from links.cli.console import EXIT_FAILED, err, out, progress_bar, report_errors, show_table, warn
+from links.cli.console import EXIT_FAILED, err, out, progress_bar, report_errors, warn
 from links.cli.live_view import LiveView
+from links.cli.run_output import nothing_found, print_result
 from links.runs.as_live import rerun_into
 from links.runs.live_run import live_graph, run_live
 from links.runs.output_hashes import hash_matches
 from links.runs.request import RunRequest, RunResult
-from links.runs.results import FIX_FILE, POSE_FILE, SUMMARY_FILE, stamp_s
+from links.runs.results import SUMMARY_FILE
 from links.runs.run_folder import replay_into
+from links.runs.shipped import CONFIGS, shipped, shipped_all, shipped_option
+from links.runs.shipped_values import shipped_values
 from links.runs.warm_up import warm_up
 from links.zenoh import host_graph
 
-TABLE_ROWS = 12
-REPOSITORY = Path(__file__).resolve().parents[2]
-DEFAULT_REPLAY_CONFIG = REPOSITORY / "configs" / "replay.yaml"
+DEFAULT_REPLAY_CONFIG = CONFIGS / "replay.yaml"
 
-Overlay = Annotated[list[Path] | None, typer.Option("--overlay", help="YAML file laid over CONFIG; may be repeated.")]
+Config = Annotated[
+    Path,
+    typer.Argument(callback=shipped, help="Configuration; a name such as `quickstart` is one that comes with grd."),
+]
+Overlay = Annotated[
+    list[Path] | None,
+    typer.Option("--overlay", callback=shipped_all, help="YAML file laid over CONFIG; may be repeated."),
+]
 Sets = Annotated[
     list[str] | None, typer.Option("--set", metavar="NAME.SETTING=VALUE", help="Change one setting; may be repeated.")
 ]
@@ -40,7 +46,7 @@ View = Annotated[bool, typer.Option("--view", help="Open the run in the Rerun vi
 
 @report_errors
 def run(
-    config: Annotated[Path, typer.Argument(help="Configuration. It runs live unless its `replay:` names a recording.")],
+    config: Config,
     out_dir: Out = None,
     overlay: Overlay = None,
     sets: Sets = None,
@@ -60,13 +66,15 @@ def run(
     host: Annotated[str | None, typer.Option("--host", metavar="NAME", help="Name of this host in FILE.")] = None,
     view: View = False,
 ) -> None:
-    """Run CONFIG live, or over the recording that it names.
+    """Run CONFIG live, or over the recording that its `replay:` names.
 
     A live run is recorded (`links.recording.Recorder`); Ctrl-C or SIGTERM ends it. Exit code 1 when a stage stopped
-    the run or was switched off after repeated errors.
+    the run or was switched off after repeated errors, when no sensor sent anything, or no drone was found.
 
     Example: grd run configs/quickstart.yaml --set track.radius_m=0.8
     """
+    if config.suffix == ".mcap":
+        raise LinkError(f"{config} is a recording: grd replay {config}")
     recording = recording_named(config, overlay or (), sets or ())
     if (hosts is None) is not (host is None):
         raise LinkError("--hosts FILE and --host NAME go together: FILE places stages on hosts, NAME is this host")
@@ -76,6 +84,7 @@ def run(
             raise LinkError(f"{option} is for live runs, and {config} replays {recording.name}: leave it out")
         _run(recording, config, out_dir, overlay or [], sets or [], view)
         return
+    err.print(f"loading {config}", markup=False)
     request = RunRequest(config, tuple(overlay or ()), tuple(sets or ()))
     graph, folder = live_graph(request), _new_folder(out_dir, f"live-{config.stem}")
     if parts := sorted(folder.glob("*.mcap")):
@@ -85,26 +94,37 @@ def run(
         )
     if hosts is not None and host is not None:
         graph = host_graph(graph, hosts, host, to_run=True)
-    with progress_bar("warm up") as step:
-        not_warm = warm_up(graph, step) if warm else None
-    for text in (*graph.left_out_texts(), *([not_warm] if not_warm else ())):
+    for text in (*graph.left_out_texts(), *shipped_values(graph)):
         warn(text)
+    if warm:
+        with progress_bar("loading compiled code (about two minutes when it must be compiled)", at_once=True) as step:
+            not_warm = warm_up(graph, step)
+        if not_warm:
+            warn(not_warm)
     with LiveView() as view_of_run:
         result = run_live(folder, request, graph, view_of_run.show, for_s, (view_of_run.latest,))
-    _print_result(result)
+    print_result(result)
     if view:
         _open_viewer(result.out_dir)
     report = result.report
     if isinstance(report, LiveReport) and report.switched_off:
         err.print(f"'{report.switched_off[0]}' was switched off after repeated errors", markup=False, style="red")
         raise typer.Exit(EXIT_FAILED)
+    if isinstance(report, LiveReport) and (texts := nothing_found(graph, result, report, config)):
+        for text in texts:
+            err.print(text, markup=False, style="red")
+        raise typer.Exit(EXIT_FAILED)
 
 
 @report_errors
 def replay_recording(
-    recording: Annotated[Path, typer.Argument(help="A .mcap recording (`grd import` converts a .pcap or .tlog).")],
+    recording: Annotated[
+        Path,
+        typer.Argument(callback=shipped, help="A .mcap recording (`grd import` converts a .pcap or .tlog)."),
+    ],
     config: Annotated[
-        Path | None, typer.Option("--config", help="Configuration [default: configs/replay.yaml].")
+        Path | None,
+        typer.Option("--config", callback=shipped_option, help="Configuration [default: configs/replay.yaml]."),
     ] = None,
     out_dir: Out = None,
     overlay: Overlay = None,
@@ -115,6 +135,13 @@ def replay_recording(
             "--as-live",
             help="Recording of a live run: re-run it with its own configuration, input order and drops, "
             "and compare the output hash.",
+        ),
+    ] = False,
+    trust: Annotated[
+        bool,
+        typer.Option(
+            "--trust",
+            help="With --as-live: the recording is your own, so import its own stages and run its taps.",
         ),
     ] = False,
     single_process: Annotated[
@@ -136,6 +163,7 @@ def replay_recording(
     The first part of a split recording stands for all parts; a later part is replayed alone. --expect takes a whole
     output hash or its first 16 digits: those cover the values, the rest covers the reason texts. With --as-live each
     stage gets the inputs of the live run in the same order; exit code 1 when the hash differs from that of the run.
+    The configuration in a recording is data: it may use the stages and links of grd only, and writes to --out only.
 
     Example: grd replay recordings/street_sweep.mcap --out out/mine
     """
@@ -144,7 +172,7 @@ def replay_recording(
             raise LinkError(
                 "--as-live takes the recording's own configuration: leave out --config, --overlay and --set"
             )
-        output_hash = _rerun(recording, out_dir, view)
+        output_hash = _rerun(recording, out_dir, view, trust)
     else:
         chosen = config or DEFAULT_REPLAY_CONFIG
         output_hash = _run(recording, chosen, out_dir, overlay or [], sets or [], view, single_process).output_hash
@@ -166,17 +194,17 @@ def _run(
     with progress_bar(f"replay {recording.name}") as step:
         request = RunRequest(config, tuple(overlays), tuple(sets))
         result = replay_into(folder, recording, request, step, single_process=single_process)
-    _print_result(result)
+    print_result(result)
     if view:
         _open_viewer(result.out_dir)
     return result
 
 
-def _rerun(recording: Path, out_dir: Path | None, view: bool) -> str:
+def _rerun(recording: Path, out_dir: Path | None, view: bool, trusted: bool) -> str:
     folder = _new_folder(out_dir, f"{recording.stem}-as-live")
     with progress_bar(f"replay {recording.name} as live") as step:
-        rerun = rerun_into(folder, recording, step)
-    _print_result(rerun.result)
+        rerun = rerun_into(folder, recording, step, trusted=trusted)
+    print_result(rerun.result)
     out.print(rerun.comparison)
     if view:
         _open_viewer(folder)
@@ -197,93 +225,6 @@ def _new_folder(wanted: Path | None, name: str) -> Path:
         number += 1
         folder = Path("out", f"{name}-{number}")
     return folder
-
-
-def _print_result(run: RunResult) -> None:
-    """Print the fixes, a summary, and the paths of the output files."""
-    results, report = run.results, run.report
-    live = isinstance(report, LiveReport)
-    for text in () if live else run.warnings:  # a live run has printed them already
-        warn(text)
-    if results.fixes:
-        show_table(_fix_table(run))
-    recorded_s = (report.last_ns - report.first_ns) / 1e9
-    parts = f" in {run.parts} parts" if run.parts is not None and run.parts > 1 else ""
-    found = f"drone accepted in {results.sweeps_with_drone} of {results.sweeps} sweeps, {len(results.fixes)} fixes"
-    out.print(
-        f"{report.records} records{parts}, {recorded_s:.1f} s recorded, {run.wall_s:.1f} s to run; "
-        f"{'no stage searches for a drone' if run.stage_outputs else found}"
-    )
-    if run.stage_outputs:
-        out.print(f"ran: {run.stage_outputs}", markup=False)
-    elif not results.sweeps:
-        out.print("no drone: no sweep was completed")
-    elif not results.fixes:
-        for result, count, example in results.search_results:
-            out.print(f"in {count} of {results.sweeps} sweeps: {result.value}; the first: {example}", markup=False)
-    for change in results.transitions[-3:]:
-        name = f"track {change.track_id}" if change.track_id > 1 else "tracker"
-        out.print(f"{name} at {stamp_s(change.stamp_ns)} s: {change.state}, {change.reason}", markup=False)
-    if run.errors is not None and len(run.errors.stamps_ns):
-        x, y, z = run.errors.rmse_xyz_m
-        out.print(
-            f"errors against the truth: RMSE x/y/z {x:.3f} {y:.3f} {z:.3f} m, 3D {run.errors.rmse_m:.3f} m; "
-            f"truth inside the 95 % ellipsoid in {100 * run.errors.inside_95:.0f} % of fixes"
-        )
-    if results.pose_states:
-        states = ", ".join(f"{count} {state}" for state, count in results.pose_states.items())
-        out.print(f"fused poses: {states}; {results.resets} jumps")
-    rejected = [
-        f"{name}: {count} {reason}"
-        for name, counters in report.counters.items()
-        for reason, count in counters.rejected.items()
-        if count
-    ]
-    if rejected:
-        out.print(f"rejected: {'; '.join(rejected)}", markup=False)
-    if run.usage is not None and str(run.usage):
-        out.print(f"used: {run.usage}")
-    out.print(f"output hash {run.output_hash}")
-    if not run.stage_outputs:
-        out.print(f"positions   {run.out_dir / FIX_FILE}")
-    if results.pose_states:
-        out.print(f"poses       {run.out_dir / POSE_FILE}")
-    out.print(f"summary     {run.out_dir / SUMMARY_FILE}")
-    if live and run.recording.is_file():
-        out.print(f"flight      {run.recording}   (re-run: grd replay {run.recording} --as-live)")
-    rerun_files = sorted(run.out_dir.glob("*.rrd"))
-    for path in rerun_files:
-        out.print(f"recording   {path}   (view: rerun {path})")
-
-
-def _fix_table(run: RunResult) -> Table:
-    """A table of at most TABLE_ROWS fixes, evenly spaced; with a column of errors when the truth is known."""
-    fixes = run.results.fixes
-    errors = {}
-    if run.errors is not None:
-        errors = dict(zip(run.errors.stamps_ns.tolist(), run.errors.error_m, strict=True))
-    step = max(1, -(-len(fixes) // TABLE_ROWS))
-    table = Table(title=f"drone in the vehicle frame, {len(fixes[::step])} of {len(fixes)} fixes", title_justify="left")
-    heads = [
-        "t [s]",
-        "x forward [m]",
-        "y left [m]",
-        "z up [m]",
-        "sigma [m]",
-        "returns",
-        *(["error [m]"] if errors else []),
-    ]
-    for head in heads:
-        table.add_column(Text(head), justify="right")
-    for fix in fixes[::step]:
-        elapsed_s = (fix.stamp_ns - run.report.first_ns) / 1e9
-        sigma_m = float(fix.covariance_m2.trace()) ** 0.5
-        cells = [f"{elapsed_s:.2f}", *(f"{v:.2f}" for v in fix.xyz_vehicle_m), f"{sigma_m:.2f}", str(fix.hits)]
-        if errors:
-            error = errors.get(fix.stamp_ns)
-            cells.append("-" if error is None else f"{float((error @ error) ** 0.5):.2f}")
-        table.add_row(*cells)
-    return table
 
 
 def _open_viewer(out_dir: Path) -> None:

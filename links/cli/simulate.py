@@ -1,4 +1,4 @@
-"""`grd simulate`, `grd matrix`: recordings of simulated flights.
+"""`grd simulate`, `grd matrix`: recordings of simulated flights; `grd flights`: their outcomes in closed loop.
 
 Source: DESIGN, Command line.
 """
@@ -13,6 +13,8 @@ import typer
 from flow.link import LinkError
 from links.cli.console import EXIT_FAILED, EXIT_USAGE, err, out, progress_bar, report_errors, warn
 from links.cli.files import Overwrite
+from links.runs.shipped import shipped, shipped_all, shipped_option
+from stages.geometry.lidar_models import LIDAR_MODELS
 
 if TYPE_CHECKING:  # the simulator is an optional dependency
     from links.simulated.matrix.flights import Cell
@@ -20,13 +22,18 @@ if TYPE_CHECKING:  # the simulator is an optional dependency
 
 ClosedLoop = Annotated[
     Path | None,
-    typer.Option("--closed-loop", metavar="CONFIG", help="Configuration whose pipeline commands the servo."),
+    typer.Option(
+        "--closed-loop",
+        metavar="CONFIG",
+        callback=shipped_option,
+        help="Configuration whose pipeline commands the servo.",
+    ),
 ]
 
 
 @report_errors
 def simulate_recording(
-    scenario: Annotated[Path, typer.Argument(help="Scenario file, as in configs/scenarios/.")],
+    scenario: Annotated[Path, typer.Argument(callback=shipped, help="Scenario file, as in configs/scenarios/.")],
     out_file: Annotated[Path, typer.Option("--out", "-o", help="Recording to write.")],
     seed: Annotated[
         int | None, typer.Option("--seed", help="Seed of scene and noise [default: the scenario's].")
@@ -44,6 +51,10 @@ def simulate_recording(
             help="Use the camera images of a recording of the same flight: rendering takes most of the time. LiDAR, "
             "servo, radio and CONFIG may differ; settings that affect the images may not.",
         ),
+    ] = None,
+    sets: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Change a setting of SCENARIO, as in autopilot.imu_hz=25."),
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:
@@ -69,6 +80,7 @@ def simulate_recording(
             closed_loop=closed_loop,
             duration_s=duration_s,
             images=images,
+            sets=sets or (),
         )
     out.print(str(report), markup=False)
 
@@ -102,6 +114,9 @@ def simulate_matrix(
         bool,
         typer.Option("--varied-sky", help="Gliding, circling and hovering birds, flocks, insects, kites, bags."),
     ] = False,
+    lidar: Annotated[
+        str, typer.Option("--lidar", metavar="MODEL", help="LiDAR of the rig, as `rig.lidar.model`: XT32, OS1-64, ...")
+    ] = "VLP-16",
     autopilot: Annotated[
         bool, typer.Option("--autopilot", help="The drone sends telemetry over a radio, and obeys flight dynamics.")
     ] = False,
@@ -174,9 +189,20 @@ def simulate_matrix(
             out.print(cell.name, markup=False)
         return
     size_px = cameras_px or Conditions.cameras_px
-    shutter_ms = readout_ms or 0.0
+    if lidar not in LIDAR_MODELS:
+        raise LinkError(f"--lidar {lidar}: not one of {', '.join(LIDAR_MODELS)}")
     conditions = Conditions(
-        calibrated, odometry, rain, autopilot, cameras_hz, size_px, shutter_ms, perturbed, sparse, varied_sky
+        calibrated,
+        odometry,
+        rain,
+        autopilot,
+        cameras_hz,
+        size_px,
+        readout_ms or 0.0,
+        lidar,
+        perturbed,
+        sparse,
+        varied_sky,
     )
     several = range(first_seed, first_seed + seeds)
     with progress_bar(f"{len(selected) * seeds} recordings") as step:
@@ -212,3 +238,50 @@ def _report(folder: Path, report: MatrixReport) -> None:
 
 def _not_installed(missing: ModuleNotFoundError) -> LinkError:
     return LinkError(f"simulating needs '{missing.name}', not installed: pip install -e '.[simulate]'")
+
+
+@report_errors
+def fly_scenarios(
+    scenarios: Annotated[
+        list[Path], typer.Argument(callback=shipped_all, help="Scenarios with an autopilot in the loop.")
+    ],
+    closed_loop: Annotated[
+        Path,
+        typer.Option(
+            "--closed-loop", metavar="CONFIG", callback=shipped, help="Configuration on whose poses the drone flies."
+        ),
+    ],
+    folder: Annotated[Path, typer.Option("--out", "-o", help="Folder for the outcomes and the table.")],
+    seeds: Annotated[int, typer.Option("--seeds", min=1, max=1000, help="Number of seeds per scenario.")] = 3,
+    first_seed: Annotated[int, typer.Option("--first-seed", min=0, help="First seed.")] = 1,
+    sets: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Change a setting of all scenarios; repeatable."),
+    ] = None,
+    jobs: Annotated[int, typer.Option("--jobs", min=1, max=256, help="Number of processes.")] = 1,
+) -> None:
+    """Fly scenarios in closed loop and write a table: OUT/flights.md, and OUT/flights.csv with a line per flight.
+
+    Outcomes of the same scenario, settings, CONFIG and seed are kept, so the command can be interrupted and repeated.
+    Changed code is not detected: use another OUT after a change. Exit code 1 when a flight was lost or sent a wrong
+    pose.
+
+    Example: grd flights configs/scenarios/flight/matrix/*.yaml --closed-loop configs/sim_flight_fixes.yaml -o out/m
+    """
+    try:
+        from links.simulated.matrix.flight_runs import fly_all
+        from links.simulated.matrix.flight_table import markdown_table, write_csv
+    except ModuleNotFoundError as missing:
+        raise _not_installed(missing) from None
+
+    several = range(first_seed, first_seed + seeds)
+    with progress_bar(f"{len(scenarios) * seeds} flights") as step:
+        results = fly_all(scenarios, sets or (), closed_loop, several, folder, jobs, step)
+    for result in results:
+        out.print(str(result), markup=False)
+    table = markdown_table(results)
+    (folder / "flights.md").write_text(table, encoding="utf-8")
+    write_csv(folder / "flights.csv", results)
+    out.print(table, markup=False)
+    if any(r.outcome is None or r.outcome["lost_s"] is not None or r.outcome["wrong_poses"] for r in results):
+        raise typer.Exit(EXIT_FAILED)

@@ -6,15 +6,13 @@ Source: ours.
 from __future__ import annotations
 
 import os
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from links.cli.console import EXIT_FAILED, out, progress_bar, report_errors
 from links.runs.output_hashes import PinResult, measure, read_pins, write_pins
-
-REPOSITORY = Path(__file__).resolve().parents[2]
+from links.runs.shipped import CONFIGS, RECORDINGS
 
 
 @report_errors
@@ -34,8 +32,7 @@ def verify(
 
     Example: grd verify street_sweep
     """
-    folder = REPOSITORY / "recordings"
-    pins = read_pins(folder, REPOSITORY / "configs", tuple(recordings or ()))
+    pins = read_pins(RECORDINGS, CONFIGS, tuple(recordings or ()))
     outcomes: list[PinResult] = []
     with progress_bar("verify") as step:
         for outcome in measure(pins, jobs or os.cpu_count() or 1):
@@ -45,8 +42,8 @@ def verify(
     for outcome in outcomes:
         out.print(f"{outcome.pin.recording.stem:20} {outcome.pin.config.stem:10} {_comparison(outcome)}", markup=False)
     if update:
-        write_pins(folder, outcomes)
-        out.print(f"pinned in {folder / 'hashes.json'}", markup=False)
+        write_pins(RECORDINGS, outcomes)
+        out.print(f"pinned in {RECORDINGS / 'hashes.json'}", markup=False)
     elif not all(outcome.values_match if values else outcome.matches for outcome in outcomes):
         raise typer.Exit(EXIT_FAILED)
 

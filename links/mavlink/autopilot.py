@@ -10,6 +10,7 @@ Source: https://mavlink.io/en/; requirements of each autopilot: `profiles.py`.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from ipaddress import IPv4Address
@@ -31,14 +32,16 @@ from links.mavlink.poses.pose_sender import PoseMessage, PoseSender
 from links.mavlink.poses.sent_state import SentState
 from links.mavlink.profiles import PROFILES, ProfileName, RequiredParameter, YawOutput, required_parameters
 from links.mavlink.readers import AutopilotMessage
+from links.mavlink.source_switch import FIRST_SET, SourceSwitch
 from links.mavlink.streams.message_intervals import MessageIntervals, MessageRates
 from links.mavlink.transport.connection import Connection, Udp, parse_connection
 from links.mavlink.transport.signing import Signer
 from links.mavlink.transport.stream_connection import open_connection
-from stages.messages import RelativePose
+from stages.messages import EarlierOdomFrame, RelativePose
 
 VISUAL_INERTIAL_ODOMETRY = 197  # MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY: our component id
 SENT_TOPIC = "/autopilot/tx"
+IS_KEY = re.compile(r"(0x)?[0-9a-fA-F]{64}")
 
 
 class AutopilotSettings(SourceSettings):
@@ -55,6 +58,7 @@ class AutopilotSettings(SourceSettings):
     send: tuple[PoseMessage, ...] = ("odometry",)  # messages per pose
     yaw: YawOutput = "none"  # none: positions in the autopilot's axes; measured: poses in `map`, EK3_SRCn_YAW 6
     source_set: int = Field(2, ge=1, le=3)  # ArduPilot: EK3_SRCn_* that are grd's; set 1 flies without it
+    switch_source: bool = False  # ArduPilot: request that set in flight, and set 1 when poses end (`source_switch.py`)
     on_rejection: OnRejection = "stop"  # when the autopilot's EKF rejects the pose: stop, reset or report
     limits: PoseLimits = PoseLimits()
     own_system_id: int | None = Field(None, ge=1, le=255)  # None: the autopilot's, as a component of its vehicle
@@ -81,6 +85,13 @@ class AutopilotSettings(SourceSettings):
             parse_connection(value)
         return value
 
+    @field_validator("signing_key", mode="before")
+    @classmethod
+    def _is_a_file(cls, value: Any) -> Any:
+        if isinstance(value, str) and IS_KEY.fullmatch(value.strip()):
+            raise ValueError("must be the path of a key file, not the key: recordings and logs contain settings")
+        return value
+
     @model_validator(mode="after")
     def _fits_together(self) -> AutopilotSettings:
         if len(set(self.send)) != len(self.send):
@@ -91,6 +102,8 @@ class AutopilotSettings(SourceSettings):
             reason = PROFILES[self.profile].unsupported.get(kind)
             if reason:
                 raise ValueError(f"send: {kind} is not supported by profile {self.profile}: {reason}")
+        if self.switch_source and (self.profile != "ardupilot" or self.source_set == FIRST_SET):
+            raise ValueError("switch_source: needs profile ardupilot and source_set 2 or 3: set 1 flies without grd")
         if self.own_id == (self.system_id, self.component_id):
             raise ValueError("own_component_id: must differ from the autopilot's component_id")
         if self.connection is not None and self.connection.startswith("udpin:"):
@@ -113,11 +126,14 @@ class Autopilot(Source[AutopilotSettings]):
         clock = DeviceClock(settings.clock_drift_limit_ppm, round(1e9 * settings.clock_jump_limit_s))
         self._decoder = FrameDecoder((settings.system_id, settings.component_id), settings.own_id, clock)
         self._session: AutopilotSession | None = None
-        self._signer: Signer | None = None  # used by all sessions, as is `_poses`, which knows what the autopilot got
+        # used by all sessions: a link that is reopened continues with the same autopilot
+        self._signer: Signer | None = None
         self._poses: PoseSender | None = None
+        self._switch: SourceSwitch | None = None
+        self._sent_state: SentState | None = None
         self._not_connected: int = 0
 
-    def decode(self, record: Record) -> AutopilotMessage | None:
+    def decode(self, record: Record) -> AutopilotMessage | EarlierOdomFrame | None:
         """The message of one frame; None for an unused or rejected frame (see `counters`), and for a sent one."""
         if record.topic == SENT_TOPIC:
             self._decoder.sent(record)
@@ -166,6 +182,8 @@ class Autopilot(Source[AutopilotSettings]):
         """Open a session on a connection. A simulation in virtual time has its own clock and no thread."""
         settings = self.settings
         target = settings.system_id, settings.component_id
+        if self._sent_state is None:
+            self._sent_state = SentState(settings.state_file, now_ns())
         if self._poses is None:
             self._poses = PoseSender(
                 settings.send,
@@ -175,6 +193,15 @@ class Autopilot(Source[AutopilotSettings]):
                 profile=settings.profile,
                 on_rejection=settings.on_rejection,
             )
+        if self._switch is None:
+            self._switch = SourceSwitch(
+                settings.source_set if settings.switch_source else None,
+                settings.required_parameters,
+                target,
+                settings.own_id,
+                self._poses.texts.warn,
+                settings.limits.position_sigma_m,
+            )
         self._session = AutopilotSession(
             connection,
             target,
@@ -182,11 +209,12 @@ class Autopilot(Source[AutopilotSettings]):
             self._poses,
             OriginSender(settings.global_origin, target),
             MessageIntervals(settings.message_rates, settings.profile, target, settings.own_id),
+            self._switch,
             self._signer,
             now_ns,
             (settings.topic, SENT_TOPIC),
             self._decoder.independence,
-            SentState(settings.state_file, now_ns()),
+            self._sent_state,
             threaded=threaded,
         )
         return self._session

@@ -21,37 +21,40 @@ PX4 src/modules/mavlink/mavlink_timesync.cpp.
 
 from __future__ import annotations
 
+import dataclasses
 import threading
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import Any
 
 from flow.link import LinkError, Record
+from links.mavlink.frame_sender import FrameSender
 from links.mavlink.origin import OriginSender
-from links.mavlink.poses.attitude_monitor import AttitudeEvent
+from links.mavlink.poses.autopilot_estimate import EstimateEvent
 from links.mavlink.poses.gate import RejectReason
 from links.mavlink.poses.independence import POSES, Independence
+from links.mavlink.poses.odom_frame import odom_frame
 from links.mavlink.poses.pose_sender import PoseSender
 from links.mavlink.poses.sent_state import SentState
+from links.mavlink.source_switch import SourceSwitch
 from links.mavlink.streams.message_intervals import MessageIntervals
-from links.mavlink.timesync_monitor import REQUEST_NS, TimesyncMonitor
+from links.mavlink.timesync_monitor import REQUEST_PERIOD_NS, TimesyncMonitor
 from links.mavlink.transport.connection import Connection
-from links.mavlink.transport.framing import FrameSplitter, dialect, header, packed
+from links.mavlink.transport.framing import FrameSplitter, dialect, header
 from links.mavlink.transport.signing import Signer
 from stages.messages import RelativePose
 
 WAKE_S = 0.05  # period of the thread, and of the check whether a waiting reader was closed
-SILENT_S = 3.0  # three heartbeats
+SILENCE_REPORTED_S = 3.0  # three heartbeats
 SECOND_NS = 1_000_000_000
-QUIET_NS = 1_500_000_000  # one and a half heartbeats: no poses are sent
+MAX_SILENCE_NS = 1_500_000_000  # one and a half heartbeats: no poses are sent
 ONBOARD_CONTROLLER, NO_AUTOPILOT = 18, 8  # MAV_TYPE, MAV_AUTOPILOT_INVALID
 NO_CONNECTION = -1
 STANDBY, ACTIVE = 3, 4  # MAV_STATE
 REJECTED = (
     "the autopilot's EKF rejects the position: no poses are sent. Is its compass, its GPS or the servo's mount wrong?"
 )
-EARLIER_POSE = "ODOMETRY"  # of an earlier run
-SENT_RECORDS = 4096  # kept until `sent` is called
+RESTART_REPORTED_NS = 600_000_000_000  # an earlier pose is probably of the same flight, which lasts 10 minutes
 
 
 class AutopilotSession:
@@ -65,6 +68,7 @@ class AutopilotSession:
         poses: PoseSender,
         origin: OriginSender,
         intervals: MessageIntervals,
+        switch: SourceSwitch,
         signer: Signer | None,
         now_ns: Callable[[], int],
         topics: tuple[str, str],
@@ -76,24 +80,26 @@ class AutopilotSession:
         """`threaded` False: nothing runs by itself; the caller gives received bytes to `receive` and calls `tick`."""
         self.counts: Counter[str] = Counter()
         self.connection, self.poses, self.origin, self.intervals = connection, poses, origin, intervals
+        self.switch = switch
         self._target, self._own = target, own
         self._signer, self._now_ns = signer, now_ns
-        self._received_topic, self._sent_topic = topics
-        self._independence = independence
+        self._received_topic, sent_topic = topics
         self._sent_state = SentState(None, now_ns()) if sent_state is None else sent_state
+        self._sender = FrameSender(connection, own, signer, now_ns, sent_topic, independence, self._sent_state)
         self._splitter = FrameSplitter()
         self._split_connection = 0  # `reconnects` of the splitter's bytes
-        self._mav = dialect().MAVLink(None, srcSystem=own[0], srcComponent=own[1])
-        self._sent: deque[Record] = deque(maxlen=SENT_RECORDS)
-        if self._sent_state.earlier is not None:
-            earlier_ns, pose = self._sent_state.earlier
-            independence.on_sent(EARLIER_POSE, earlier_ns)
-            self._sent.append(Record(self._sent_topic, now_ns(), earlier_ns, pose))
+        earlier = self._sender.report_earlier()
+        self._earlier_odom: tuple[int, bytes] | None = None  # of an earlier run, until it is a record
+        if earlier is not None:
+            earlier_ns, odom = earlier
+            self._earlier_odom = None if odom is None else (earlier_ns, odom)
+            if now_ns() - earlier_ns < RESTART_REPORTED_NS:
+                poses.texts.warn(f"restarted {(now_ns() - earlier_ns) * 1e-9:.0f} s after its last pose")
         self._lock = threading.Lock()  # for numbering, signing and sending
         self._closed = threading.Event()
         self._heartbeat_ns = self._request_ns = 0
         self._timesync = TimesyncMonitor()
-        self._left_late = 0  # late frames of the connection that were handled
+        self._late_frames = 0  # late frames of the connection that were handled
         self._target_ns = now_ns()  # when the autopilot's newest frame arrived, or the session started
         self._target_connection: int | None = None  # `reconnects` at its newest frame; NO_CONNECTION: not authenticated
         if signer is not None:
@@ -116,7 +122,10 @@ class AutopilotSession:
             yield from self.receive(*received, self._now_ns())
 
     def receive(self, data: bytes, source: tuple[str, int], arrival_ns: int) -> Iterator[Record]:
-        """Records of received bytes; answers to them are sent at once."""
+        """Records of received bytes, after the state of an earlier run; answers to them are sent at once."""
+        if self._earlier_odom is not None:
+            (earlier_ns, odom), self._earlier_odom = self._earlier_odom, None
+            yield Record(self._received_topic, arrival_ns, earlier_ns, odom)
         if self._split_connection != self.connection.reconnects:
             self._splitter.reset()
             self._split_connection = self.connection.reconnects
@@ -128,32 +137,38 @@ class AutopilotSession:
 
     def send_pose(self, pose: RelativePose) -> None:
         """Send a pose, or reject it. Never blocks."""
+        if self.poses.sends_yaw:  # the autopilot adopts it: the yaw of its axes is no longer the one that was learnt
+            pose = dataclasses.replace(pose, odom_yaw_rad=None, odom_yaw_sigma_rad=None)
         with self._lock:
             now_ns = self._now_ns()
             self._send_periodic(now_ns)
             messages = self.poses.messages(pose, now_ns, self._link_reason(now_ns))
-            sent = [message for message in messages if self._send(message)]
+            sent = [message for message in messages if self._send(message, pose)]
             if sent:
                 self.poses.on_sent(pose, now_ns, sent)
+                if any(message.get_type() in POSES for message in sent):
+                    self.switch.on_sent(pose, self.poses.autopilot, now_ns)
             self._send_texts(now_ns)
 
     def sent(self) -> list[Record]:
         """Records of the frames sent since the previous call."""
         with self._lock:
-            records = list(self._sent)
-            self._sent.clear()
-        return records
+            return self._sender.records()
 
     @property
     def counters(self) -> dict[str, int]:
         """Totals since the start: received, sent, not sent, rejected poses by reason."""
         with self._lock:
             rejected = {f"pose rejected: {reason.value}": count for reason, count in self.poses.rejected.items()}
-            counts = dict(self.counts)
+            counts = self.counts | self._sender.counts
             if self.poses.fusion.rejections:
                 counts["pose rejected by the autopilot"] = self.poses.fusion.rejections
             if self.origin.sent_times:
                 counts["origin sent"] = self.origin.sent_times
+            if self.switch.requests:
+                counts["source sets requested"] = self.switch.requests
+            if self.switch.agreement.disagreements:
+                counts["pose and autopilot differ"] = self.switch.agreement.disagreements
             round_trip_ns = self._timesync.newest_ns
             intervals = self.intervals.counters
         return {
@@ -164,7 +179,7 @@ class AutopilotSession:
             "from other senders": self.connection.foreign,
             "reconnects": self.connection.reconnects,
             "closed: blocked": self.connection.stalls,
-            "sent late": self.connection.left_late,
+            "sent late": self.connection.late_frames,
             **({"round trip [ms]": round_trip_ns // 1_000_000} if round_trip_ns is not None else {}),
             **({"signing time not written": self._signer.unwritten} if self._signer is not None else {}),
         }
@@ -189,14 +204,16 @@ class AutopilotSession:
             or signing
             or self._sent_state.status
             or self.intervals.status
+            or self.switch.status
         )
 
     def _silence(self) -> str | None:
-        if self._now_ns() - self._target_ns < SILENT_S * SECOND_NS:
+        if self._now_ns() - self._target_ns < SILENCE_REPORTED_S * SECOND_NS:
             return None
         return (
             f"no frame from the autopilot (system {self._target[0]}, component {self._target[1]}) for "
-            f"{SILENT_S:g} s: is it powered, is this its connection, and are system_id and component_id correct?"
+            f"{SILENCE_REPORTED_S:g} s: is it powered, is this its connection, and are system_id and component_id "
+            "correct?"
         )
 
     def close(self) -> None:
@@ -225,7 +242,7 @@ class AutopilotSession:
             self.counts["received"] += 1
             if sender == self._target:
                 self.connection.reply_to(source)
-                if self._now_ns() - self._target_ns > SILENT_S * SECOND_NS:
+                if self._now_ns() - self._target_ns > SILENCE_REPORTED_S * SECOND_NS:
                     self.origin.restart()
                     self.intervals.restart()
                 if not self._is_reachable(self._now_ns()):
@@ -234,9 +251,9 @@ class AutopilotSession:
                 self._target_ns, self._target_connection = self._now_ns(), self.connection.reconnects
                 self.origin.on_message(message)
                 self.poses.on_estimator_status(message, arrival_ns)
-                if message.get_type() == "ATTITUDE":
-                    self._on_attitude(message, arrival_ns)
+                self._on_estimate(self.poses.autopilot.add(message, arrival_ns))
                 self.intervals.on_message(message, arrival_ns)
+                self.switch.on_message(message, arrival_ns)
                 if message.get_type() == "TIMESYNC":
                     if message.tc1 == 0:
                         self._send(dialect().MAVLink_timesync_message(self._now_ns(), message.ts1))
@@ -244,16 +261,15 @@ class AutopilotSession:
                         return message.ts1
         return arrival_ns
 
-    def _on_attitude(self, message: Any, arrival_ns: int) -> None:
-        """The autopilot's attitude, and what it shows. The lock is held."""
-        event = self.poses.attitude.add(message, arrival_ns)
-        if event is AttitudeEvent.BOOTED:
+    def _on_estimate(self, event: EstimateEvent | None) -> None:
+        """What the autopilot's own estimate shows. The lock is held."""
+        if event is EstimateEvent.BOOTED:
             self.poses.on_boot()
             self.origin.restart()
-        elif event is AttitudeEvent.YAW_RESET:
+            self.intervals.restart()
+            self.switch.on_boot()
+        elif event is EstimateEvent.YAW_RESET:
             self.poses.on_yaw_reset()
-        if self.poses.attitude.newest is not None:
-            self.poses.on_attitude(self.poses.attitude.newest)
 
     def _accept_for_heartbeats(self, source: tuple[str, int]) -> None:
         """Send heartbeats, but no poses, to an autopilot that signs with an old time until it receives our time.
@@ -268,7 +284,7 @@ class AutopilotSession:
         """Whether the autopilot presumably receives frames now. Over UDP this includes one that never sent any."""
         if self._target_connection is None:
             return self.connection.datagrams
-        return self._target_connection == self.connection.reconnects and now_ns - self._target_ns < QUIET_NS
+        return self._target_connection == self.connection.reconnects and now_ns - self._target_ns < MAX_SILENCE_NS
 
     def _link_reason(self, now_ns: int) -> RejectReason | None:
         """Why no pose may be sent over the link now. The lock is held."""
@@ -279,7 +295,6 @@ class AutopilotSession:
     def _run(self) -> None:
         while not self._closed.wait(WAKE_S):
             self.tick()
-            self._sent_state.write()
             if self._signer is not None:
                 self._signer.write_timestamp()
 
@@ -289,14 +304,14 @@ class AutopilotSession:
             state = ACTIVE if self.poses.sending else STANDBY
             if self._send(dialect().MAVLink_heartbeat_message(ONBOARD_CONTROLLER, NO_AUTOPILOT, 0, 0, state, 3)):
                 self._heartbeat_ns = now_ns
-        if now_ns - self._request_ns >= REQUEST_NS:
+        if now_ns - self._request_ns >= REQUEST_PERIOD_NS:
             request_ns = self._now_ns()
             if self._send(dialect().MAVLink_timesync_message(0, request_ns)):
                 self._request_ns = now_ns
                 if self._timesync.on_request(request_ns):
                     self.poses.texts.warn("no TIMESYNC replies: latency unknown")
-        if self.connection.left_late != self._left_late:
-            self._left_late = self.connection.left_late
+        if self.connection.late_frames != self._late_frames:
+            self._late_frames = self.connection.late_frames
             self._timesync.on_late_frame(now_ns)
 
     def tick(self) -> None:
@@ -311,7 +326,11 @@ class AutopilotSession:
                 request = self.intervals.due(now_ns)
                 if request is not None and not self._send(request):
                     self.intervals.on_not_sent()
+                request = self.switch.due(now_ns)
+                if request is not None and not self._send(request):
+                    self.switch.on_not_sent()
             self._send_texts(now_ns)
+        self._sent_state.write()
 
     def _send_texts(self, now_ns: int) -> None:
         """Send the text that is due. The lock is held."""
@@ -319,19 +338,8 @@ class AutopilotSession:
             if not self._send(message):
                 self.poses.texts.on_not_sent()
 
-    def _send(self, message: Any) -> bool:
-        """Pack, sign and send one message. The lock is held."""
-        now_ns = self._now_ns()
-        if self._signer is not None:
-            self._signer.sign_for(self._mav, now_ns)
-        frame = packed(message, self._mav)
-        kind = message.get_type()
-        if not self.connection.send(frame):
-            self.counts[f"not sent: {kind}"] += 1
-            return False
-        self.counts[f"sent: {kind}"] += 1
-        self._independence.on_sent(kind, now_ns)
-        if kind in POSES:
-            self._sent_state.on_sent(frame, now_ns)
-        self._sent.append(Record(self._sent_topic, now_ns, now_ns, frame))
-        return True
+    def _send(self, message: Any, pose: RelativePose | None = None) -> bool:
+        """Send one message, of a pose if it is one. The lock is held."""
+        return self._sender.send(
+            message, None if pose is None else lambda: odom_frame(pose, self.poses.autopilot, self._own)
+        )

@@ -18,12 +18,13 @@ from typing import Any
 from flow.link import Record
 from links.clock.device_clock import DeviceClock
 from links.mavlink.poses.independence import Independence
+from links.mavlink.poses.odom_frame import read_odom_frame
 from links.mavlink.readers import READERS, TIMELESS_READERS, AutopilotMessage
 from links.mavlink.streams.imu_stamps import DELAY_NS, ImuSelection, time_since_boot_us
 from links.mavlink.transport.framing import SEQUENCE, header, known, parse_frame, timesync_target
-from stages.messages import AutopilotStatus, DroneAttitude, DroneLocalPosition, DroneOdometry
+from stages.messages import AutopilotStatus, DroneAttitude, DroneLocalPosition, DroneOdometry, EarlierOdomFrame
 
-HALF_MS_NS = 500_000  # time_boot_ms is truncated, on average half a millisecond early
+BOOT_TIME_TRUNCATION_NS = 500_000  # time_boot_ms is truncated, on average half a millisecond early
 ARMED = 128  # MAV_MODE_FLAG_SAFETY_ARMED
 CRITICAL = 5  # MAV_STATE_CRITICAL; above: emergency, poweroff, termination
 FOREIGN_TIMESYNC = "TIMESYNC for another component"  # reason in `rejected`
@@ -46,22 +47,24 @@ class FrameDecoder:
         self._imu = ImuSelection()
         self._matched = False  # replies to our TIMESYNC are recorded with the request's time as stamp
 
-    def decode(self, record: Record) -> AutopilotMessage | None:
+    def decode(self, record: Record) -> AutopilotMessage | EarlierOdomFrame | None:
         """The message of one frame; None for an unused or rejected frame (see `rejected`)."""
         try:
             frame = parse_frame(record.data)
         except ValueError:
-            return self._refuse("damaged")
+            return self._reject("damaged")
         sender, number = header(record.data)
+        if sender == self._own:
+            return self._earlier_run(frame, record.stamp_ns)
         if sender != self._sender:
-            return self._refuse("from another system")
+            return self._reject("from another system")
         kind = frame.get_type()
         if not known(frame):  # its checksum is unknown: its number is used only if it is the expected one
             if self._sequence is not None and number == (self._sequence + 1) % SEQUENCE:
                 self._sequence = number
-            return self._refuse("unknown message")
+            return self._reject("unknown message")
         if not self._in_sequence(number):
-            return self._refuse("repeated or late")
+            return self._reject("repeated or late")
         if kind == "TIMESYNC":
             return self._timesync(frame, record)
         if kind == "HEARTBEAT":
@@ -77,18 +80,25 @@ class FrameDecoder:
             return None
         stamp_ns = self._stamp(frame, record.arrival_ns)
         if stamp_ns is None:
-            return self._refuse("inconsistent time")
+            return self._reject("inconsistent time")
         if stamp_ns <= self._last_ns.get(kind, -1):  # a faster message has corrected the clock
-            return self._refuse("not newer than the last one")
+            return self._reject("not newer than the last one")
         try:
             message = reader(frame, stamp_ns)
             if isinstance(message, ESTIMATES):
                 message = dataclasses.replace(message, independent=self._independent(record.arrival_ns))
         except ValueError as error:
-            return self._refuse(str(error))
+            return self._reject(str(error))
         self._last_ns[kind] = stamp_ns
         self.decoded += 1
         return message
+
+    def _earlier_run(self, frame: Any, stamp_ns: int) -> EarlierOdomFrame | None:
+        """State of an earlier run, which the session reports as a received frame of our own."""
+        try:
+            return read_odom_frame(frame, stamp_ns)
+        except (AttributeError, ValueError):
+            return self._reject("echo of our own")
 
     def _stamp(self, frame: Any, arrival_ns: int) -> int | None:
         """Time of the measurement on the host's timeline; None while the device's clock is inconsistent."""
@@ -97,7 +107,7 @@ class FrameDecoder:
         stamp_ns = self.clock.read(device_ns, arrival_ns)
         if stamp_ns is None:
             return None
-        return min(stamp_ns + HALF_MS_NS * in_ms, arrival_ns) - DELAY_NS.get(kind, 0)
+        return min(stamp_ns + BOOT_TIME_TRUNCATION_NS * in_ms, arrival_ns) - DELAY_NS.get(kind, 0)
 
     def _device_ns(self, kind: str, time_usec: int, arrival_ns: int) -> int:
         offset_ns = self.clock.offset_ns
@@ -109,7 +119,7 @@ class FrameDecoder:
         try:
             self.independence.on_sent(parse_frame(record.data).get_type(), record.stamp_ns)
         except ValueError:
-            self._refuse("damaged")
+            self._reject("damaged")
 
     def _independent(self, arrival_ns: int) -> bool:
         if self.clock.offset_ns is not None:
@@ -143,9 +153,9 @@ class FrameDecoder:
             self.clock.forget_replies()
         targets = zip(timesync_target(record.data), self._own, strict=True)
         if not matches and (self._matched or any(name not in (0, ours) for name, ours in targets)):
-            self._refuse(FOREIGN_TIMESYNC)
+            self._reject(FOREIGN_TIMESYNC)
         elif not self.clock.round_trip(frame.ts1, frame.tc1, record.arrival_ns):
-            self._refuse("TIMESYNC foreign or too slow")
+            self._reject("TIMESYNC foreign or too slow")
 
     def _status(self, frame: Any, arrival_ns: int) -> AutopilotStatus:
         drift_ppm, drift_sigma_ppm = self.clock.drift.ppm or (None, None)
@@ -161,5 +171,5 @@ class FrameDecoder:
             clock_drift_sigma_ppm=drift_sigma_ppm,
         )
 
-    def _refuse(self, reason: str) -> None:
+    def _reject(self, reason: str) -> None:
         self.rejected[reason] += 1

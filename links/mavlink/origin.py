@@ -17,11 +17,12 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from links.mavlink.commands import ACCEPTED, DENIED, FAILED, command_long
 from links.mavlink.transport.framing import dialect
 
 REQUEST_MESSAGE, GPS_GLOBAL_ORIGIN = 512, 49  # MAV_CMD, message id
-HAS_NONE = (0, 2, 4)  # MAV_RESULT accepted (and sends nothing), denied, failed: it supports the message
-REQUEST_NS = 1_000_000_000  # period of requests
+HAS_NONE = (ACCEPTED, DENIED, FAILED)  # accepted (and sends nothing), denied, failed: it supports the message
+REQUEST_PERIOD_NS = 1_000_000_000  # period of requests
 REQUESTS = 3
 UNCONFIRMED = 10  # times that an origin is sent before it is reported
 
@@ -76,7 +77,7 @@ class OriginSender:
         """Messages to send now."""
         if self.done or self._origin is None:
             return []
-        if self._requested_ns is not None and now_ns - self._requested_ns < REQUEST_NS:
+        if self._requested_ns is not None and now_ns - self._requested_ns < REQUEST_PERIOD_NS:
             return []
         if self._replies >= (REQUESTS if self.state is OriginState.REQUESTING else 1):
             self.state, self._replies, self._requested_ns = OriginState.SENT, 0, now_ns
@@ -92,11 +93,7 @@ class OriginSender:
                 )
             ]
         self._requested_ns, self._replied = now_ns, False
-        return [
-            dialect().MAVLink_command_long_message(
-                *self._target, REQUEST_MESSAGE, 0, float(GPS_GLOBAL_ORIGIN), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-            )
-        ]
+        return [command_long(self._target, REQUEST_MESSAGE, float(GPS_GLOBAL_ORIGIN))]
 
     def restart(self) -> None:
         """Start again: the autopilot was silent, and may have rebooted without an origin."""

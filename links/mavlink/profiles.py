@@ -31,6 +31,7 @@ PX4 (1.14 and later; EKF2)
 - time_usec is converted by its own TIMESYNC requests, which grd answers; until they have converged (500 requests) it
   uses the arrival time.
 - estimator_type must be VIO or VISION; LIDAR is rejected.
+- HIGHRES_IMU lacks the biases that EKF2 estimates (`readers.py`): it is not independent of poses to that extent.
 
 Source: ArduPilot libraries/AP_VisualOdom/*.cpp, GCS_MAVLINK::handle_odometry, NavEKF3_core::writeExtNavData,
 AP_NavEKF_Source::useVelXYSource, AP_Arming::visodom_checks,

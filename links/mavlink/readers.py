@@ -4,8 +4,12 @@ RAW_IMU is read in ArduPilot's units, which are SCALED_IMU's (mg, mrad/s), HIGHR
 is used: `streams/imu_stamps.py`. SCALED_IMU2 and SCALED_IMU3, of other sensors, are not read. The functions raise
 ValueError for non-finite values.
 
-Source: https://mavlink.io/en/messages/common.html; ArduPilot GCS_MAVLINK::send_raw_imu for RAW_IMU's units,
-NavEKF3_core::send_status_report and getVariances for EKF_STATUS_REPORT.
+HIGHRES_IMU is not raw: PX4 subtracts the biases that EKF2 estimates (estimator_sensor_bias). They change within tens of
+seconds, and after the first sent pose they depend on it. The fusion estimates a bias of its own, which follows them.
+ArduPilot's RAW_IMU and SCALED_IMU hold the calibrated samples without the bias of its EKF.
+
+Source: https://mavlink.io/en/messages/common.html; PX4 src/modules/mavlink/streams/HIGHRES_IMU.hpp; ArduPilot
+GCS_MAVLINK::send_raw_imu for RAW_IMU's units, NavEKF3_core::send_status_report and getVariances for EKF_STATUS_REPORT.
 """
 
 from __future__ import annotations

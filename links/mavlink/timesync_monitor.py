@@ -21,10 +21,10 @@ from __future__ import annotations
 
 from collections import deque
 
-REQUEST_NS = 250_000_000  # period of requests
-LATE_NS = 300_000_000  # the autopilot treats a longer delay as a timeout
+REQUEST_PERIOD_NS = 250_000_000  # period of requests
+MAX_LATENCY_NS = 300_000_000  # the autopilot treats a longer delay as a timeout
 WINDOW, LATE_IN_WINDOW = 3, 2
-LATE_FRAMES_NS = 1_000_000_000  # between two frames that left late
+LATE_FRAMES_WITHIN_NS = 1_000_000_000  # between two frames that left late
 UNANSWERED = 8  # 2 s; with 20 % frame loss this happens once per quarter of an hour
 GIVEN_UP = 108  # 27 s; half a minute with the first waiting time
 FIRST_WAIT_NS, MAX_WAIT_NS = 3_000_000_000, 60_000_000_000
@@ -58,9 +58,9 @@ class TimesyncMonitor:
         """Error text while poses would arrive late, or the latency is unknown."""
         if self.late:
             return (
-                f"TIMESYNC replies take longer than {1e-9 * LATE_NS:g} s or are missing, or the local line is that "
-                "slow: no poses are sent, they would arrive late. Is a radio, bridge or line too slow for the poses "
-                "(clock.rate_hz), or for the autopilot's messages (SRn_...)?"
+                f"TIMESYNC replies take longer than {1e-9 * MAX_LATENCY_NS:g} s or are missing, or the local line is "
+                "that slow: no poses are sent, they would arrive late. Is a radio, bridge or line too slow for the "
+                "poses (clock.rate_hz), or for the autopilot's messages (SRn_...)?"
             )
         if self.latency_unknown:
             return (
@@ -93,15 +93,15 @@ class TimesyncMonitor:
         self._pending.remove(request_ns)
         self._open = self.latency_unknown = False
         self._unanswered = 0
-        if sending and not self.late and arrival_ns - request_ns <= LATE_NS:
+        if sending and not self.late and arrival_ns - request_ns <= MAX_LATENCY_NS:
             self._unproven = max(0, self._unproven - 1)
         self._round_trips_ns.append(arrival_ns - request_ns)
         self._update(arrival_ns)
         return True
 
     def on_late_frame(self, now_ns: int) -> None:
-        """One or several frames took longer than LATE_NS to leave the local send buffer."""
-        repeated = self._late_frame_ns is not None and now_ns - self._late_frame_ns <= LATE_FRAMES_NS
+        """One or several frames took longer than MAX_LATENCY_NS to leave the local send buffer."""
+        repeated = self._late_frame_ns is not None and now_ns - self._late_frame_ns <= LATE_FRAMES_WITHIN_NS
         self._late_frame_ns = now_ns
         self._update(now_ns, repeated)
 
@@ -115,7 +115,7 @@ class TimesyncMonitor:
         self.latency_unknown = False
 
     def _update(self, now_ns: int, late_frames: bool = False) -> None:
-        late = [round_trip_ns > LATE_NS for round_trip_ns in self._round_trips_ns]
+        late = [round_trip_ns > MAX_LATENCY_NS for round_trip_ns in self._round_trips_ns]
         if sum(late) >= LATE_IN_WINDOW or late_frames or self._unanswered >= UNANSWERED:
             if not self.late:
                 self._wait_ns = min(2 * self._wait_ns, MAX_WAIT_NS) if self._unproven else FIRST_WAIT_NS

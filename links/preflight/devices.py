@@ -8,13 +8,13 @@ from flow.link import Link
 from links.camera.checks import CameraChecks
 from links.clock import Clock
 from links.dynamixel.checks import ServoChecks
+from links.lidar.checks import LidarChecks
 from links.mavlink.checks import AutopilotChecks
 from links.preflight.check_result import CheckResult
 from links.preflight.link_checks import LinkChecks
 from links.preflight.observations import Observations, ObservedSource
 from links.recording.checks import RecorderChecks
 from links.vehicle_odometry.checks import VehicleOdometryChecks
-from links.velodyne.checks import LidarChecks
 
 
 class ClockChecks(LinkChecks):

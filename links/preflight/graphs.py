@@ -26,6 +26,6 @@ def tracking(graph: Graph) -> Graph:
     return replace(graph, nodes=nodes, edges=tuple(e for e in edges if {e.producer, e.consumer} <= set(nodes)))
 
 
-def sees_drones(graph: Graph) -> bool:
+def locates_drones(graph: Graph) -> bool:
     """Whether any stage outputs DroneFix."""
     return any(DroneFix in output_ports(spec.cls).values() for spec in graph.nodes.values())

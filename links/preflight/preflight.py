@@ -13,7 +13,7 @@ from flow.graph import Graph
 from links.preflight.check_result import CheckResult, fail, warning
 from links.preflight.collect import ObservationTap, collect_live, collect_recording, simulated_rig
 from links.preflight.devices import DEVICES, checks_for
-from links.preflight.graphs import sees_drones, sources_only, tracking
+from links.preflight.graphs import locates_drones, sources_only, tracking
 from links.preflight.hand_motion import MOTIONS, HandMotion, check_motion
 from links.preflight.motion_checks import motion_checks
 from links.preflight.observations import Observations
@@ -76,7 +76,7 @@ def configuration_checks(graph: Graph) -> Iterator[CheckResult]:
     """Results that follow from the configuration alone."""
     for checks in DEVICES:
         yield from checks.check_configuration(graph)
-    if not sees_drones(graph):
+    if not locates_drones(graph):
         yield fail("stages", "no stage of this configuration locates the drone")
 
 

@@ -88,8 +88,8 @@ _SERVO = {
 TOPICS: dict[str, Topic] = {
     topic.name: topic
     for topic in (
-        _raw("/lidar/packets", "velodyne-data", "VLP-16 data packet: the 1206-byte UDP payload"),
-        _raw("/lidar/position", "velodyne-position", "VLP-16 position packet: the 512-byte UDP payload"),
+        _raw("/lidar/packets", "velodyne-data", "a LiDAR's data packet: the UDP payload; channel metadata: model"),
+        _raw("/lidar/position", "velodyne-position", "a Velodyne's position packet: the 512-byte UDP payload"),
         _json("/servo/state", "grd.ServoState", _SERVO, "servo reading; stamp = middle of request and reply"),
         _jpeg("/camera/vehicle", "vehicle fisheye, JPEG"),
         _jpeg("/camera/drone", "drone fisheye, JPEG"),

@@ -1,8 +1,8 @@
-"""Imports a VLP-16 `.pcap` or a MAVLink `.tlog` as a recording; the contents decide the file type.
+"""Imports a LiDAR's `.pcap` or a MAVLink `.tlog` as a recording; the contents decide the file type.
 
 The time of a packet in the file is used as arrival and as stamp: no better time of the measurement is known.
 
-Source: ours; VLP-16 user manual 63-9243 Rev. E, chapter 9 (packets, ports, product ids).
+Source: ours.
 """
 
 from __future__ import annotations
@@ -20,28 +20,32 @@ from typing import IO
 from mcap.writer import MCAP0_MAGIC
 
 from flow.link import LinkError, Record
+from links.lidar import AnyFormat, packet_format, recognised_model, rig_unit
+from links.lidar.ouster import DATA_PORT as OUSTER_PORT
+from links.lidar.reject_reason import PacketRejectReason
+from links.lidar.velodyne import POSITION_BYTES, POSITION_PORT
 from links.recording.format import Progress
 from links.recording.pcap import Datagram, PcapReport, is_pcap, read_datagrams
 from links.recording.reader import open_file
 from links.recording.tlog import TlogReport, looks_like_tlog, read_frames
 from links.recording.writer import RecordingWriter
-from links.velodyne import vlp16
+from stages.geometry.rig_lidar import RigLidar
 
 _LIDAR, _POSITION, _AUTOPILOT = "/lidar/packets", "/lidar/position", "/autopilot/rx"
 _PROGRESS_EVERY = 1000  # records
 _SNIFF_BYTES = 4096
 
 DEFAULT_RIG = """\
-# Made by `grd import`: a capture does not say how its lidar was mounted. This assumes a VLP-16 bolted down upright,
+# Made by `grd import`: a capture does not say how its lidar was mounted. This assumes a {model} bolted down upright,
 # without servo, 1.8 m over the vehicle's origin. The true mount is unknown: positions are relative to this guess.
 version: 1
 lidar:
-  model: VLP-16
+  model: {model}
   mount:
     turns: false
-    T_vehicle_turntable: {xyz_m: [0.0, 0.0, 1.8]}
-    T_turntable_lidar: {xyz_m: [0.0, 0.0, 0.0]}
-drone: {span_m: 0.5}
+    T_vehicle_turntable: {{xyz_m: [0.0, 0.0, 1.8]}}
+    T_turntable_lidar: {{xyz_m: [0.0, 0.0, 0.0]}}
+drone: {{span_m: 0.5}}
 """
 
 
@@ -60,15 +64,16 @@ def import_file(
     out: str | os.PathLike[str] | None = None,
     *,
     rig_yaml: str | None = None,
-    port: int = vlp16.DATA_PORT,
+    port: int | None = None,
     sender: str | None = None,
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> ImportReport:
     """Convert a .pcap or .tlog to a recording next to it (or at `out`).
 
-    `port` and `sender` (IPv4 address) choose the lidar in a capture; `rig_yaml` is the text of its calibration, by
-    default DEFAULT_RIG for a capture and none for a telemetry log. LinkError when the file has no usable record; a
+    `port` (None: the model's own) and `sender` (IPv4 address) choose the lidar in a capture; `rig_yaml` is the text of
+    its calibration, by default DEFAULT_RIG for a capture and none for a telemetry log. Without a rig the packets name
+    the model; an Ouster's do not. LinkError when the file has no usable record; a
     partial output is removed.
     """
     source = Path(path)
@@ -76,7 +81,7 @@ def import_file(
     with open_file(source) as stream:
         if target.exists() and target.samefile(source):
             raise LinkError(f"{target} is the file to import: give the recording another name")
-        imported = _recognise(stream, source, port, sender)
+        imported = _recognise(stream, source, port, sender, rig_yaml)
         records = imported.records()
         first = next(records, None)
         if first is None:
@@ -85,7 +90,7 @@ def import_file(
         total_bytes = source.stat().st_size
         writer = RecordingWriter(
             target,
-            rig_yaml=rig_yaml or imported.default_rig,
+            rig_yaml=rig_yaml or imported.default_rig(),
             metadata={"imported_from": source.name},
             channels=imported.channels(),
             lossless=True,
@@ -107,11 +112,13 @@ def import_file(
     return ImportReport(target, dict(topics), imported.skipped(), imported.warnings())
 
 
-def _recognise(stream: IO[bytes], source: Path, port: int, sender: str | None) -> _ImportedFile:
+def _recognise(
+    stream: IO[bytes], source: Path, port: int | None, sender: str | None, rig_yaml: str | None
+) -> _ImportedFile:
     start = stream.read(_SNIFF_BYTES)
     stream.seek(0)
     if is_pcap(start):
-        return _Capture(stream, source, port, sender)
+        return _Capture(stream, source, port, sender, None if rig_yaml is None else rig_unit(rig_yaml, "--rig"))
     if start.startswith(MCAP0_MAGIC):
         raise LinkError(f"{source} is an MCAP file already: use it as it is (`grd replay {source}`)")
     if source.suffix == ".tlog" or looks_like_tlog(start):
@@ -122,7 +129,9 @@ def _recognise(stream: IO[bytes], source: Path, port: int, sender: str | None) -
 class _ImportedFile(ABC):
     """A file that can be imported."""
 
-    default_rig: str | None = None
+    def default_rig(self) -> str | None:
+        """Rig where none is given, after the first record."""
+        return None
 
     @abstractmethod
     def records(self) -> Iterator[Record]:
@@ -150,17 +159,25 @@ class _ImportedFile(ABC):
 
 
 class _Capture(_ImportedFile):
-    """One VLP-16's packets in a pcap capture."""
+    """One LiDAR's packets in a pcap capture."""
 
-    default_rig = DEFAULT_RIG
-
-    def __init__(self, stream: IO[bytes], source: Path, port: int, sender: str | None) -> None:
+    def __init__(
+        self, stream: IO[bytes], source: Path, port: int | None, sender: str | None, unit: RigLidar | None
+    ) -> None:
         self._stream = stream
         self._source = source
-        self._port = port
+        self._given_port = port
         self._sender = sender
+        self._form: AnyFormat | None = unit and packet_format(unit.model, unit.beams)
         self._report = PcapReport()
         self._other_ports: Counter[int] = Counter()  # data packets on other ports
+
+    @property
+    def _port(self) -> int:
+        return self._given_port or (self._form or packet_format("VLP-16")).factory_port
+
+    def default_rig(self) -> str | None:
+        return DEFAULT_RIG.format(model=self._form.profile.model) if self._form else None
 
     def records(self) -> Iterator[Record]:
         skipped = self._report.skipped
@@ -171,11 +188,10 @@ class _Capture(_ImportedFile):
             elif datagram.sender != (self._sender or datagram.sender):
                 skipped[f"from another sender, {datagram.sender}"] += 1
             else:
+                stamp_ns = datagram.time_ns  # of a position packet: its arrival
                 if topic == _LIDAR:
-                    self._check_model(datagram)
+                    stamp_ns = self._checked(datagram).first_pulse_ns(datagram.time_ns, datagram.payload)
                     self._sender = datagram.sender
-                # other payloads than data packets keep their arrival time
-                stamp_ns = vlp16.first_pulse_ns(datagram.time_ns, datagram.payload)
                 yield Record(topic, datagram.time_ns, stamp_ns, datagram.payload)
 
     def done_bytes(self) -> int:
@@ -188,49 +204,61 @@ class _Capture(_ImportedFile):
         return self._report.warnings
 
     def channels(self) -> dict[str, dict[str, str]]:
-        known = {"model": "VLP-16", **({"sender": self._sender} if self._sender else {})}
-        return {_LIDAR: {**known, "port": str(self._port)}, _POSITION: {**known, "port": str(vlp16.POSITION_PORT)}}
+        model = self._form.profile.model if self._form else ""
+        known = {"model": model, **({"sender": self._sender} if self._sender else {})}
+        return {_LIDAR: {**known, "port": str(self._port)}, _POSITION: {**known, "port": str(POSITION_PORT)}}
 
     def nothing_found(self) -> str:
-        text = f"{self._source}: no VLP-16 packet ({vlp16.PACKET_BYTES} bytes) on UDP port {self._port}"
+        what = f"{self._form.profile.model} packet ({self._form.packet_bytes} bytes)" if self._form else "LiDAR packet"
+        text = f"{self._source}: no {what} on UDP port {self._port}"
         if self._sender:
             text += f" from {self._sender}"
         if self._other_ports:
             ((port, count),) = self._other_ports.most_common(1)
             return f"{text}; {count} on port {port}: try --port {port}"
+        if self._form is None and f"on UDP port {OUSTER_PORT}" in self._report.skipped:
+            text += f"; UDP port {OUSTER_PORT} is an Ouster's, which needs its metadata: --rig METADATA.json"
         seen = [f"{count} packets {reason}" for reason, count in self._report.skipped.most_common(3)]
         return "; ".join([text, *seen, *self._report.warnings])
 
     def _topic(self, datagram: Datagram) -> str | None:
-        size = len(datagram.payload)
-        if size == vlp16.PACKET_BYTES:
+        payload = datagram.payload
+        if self._form is None:
+            model = recognised_model(payload)
+            self._form = None if model is None else packet_format(model)
+        form = self._form or packet_format("VLP-16")
+        if form.is_data(payload):
             if datagram.port == self._port:
                 return _LIDAR
             self._other_ports[datagram.port] += 1
-        elif size == vlp16.POSITION_BYTES and datagram.port == vlp16.POSITION_PORT:
+        elif len(payload) == POSITION_BYTES and datagram.port == POSITION_PORT:
             return _POSITION
         return None
 
-    def _check_model(self, datagram: Datagram) -> None:
-        product = datagram.payload[vlp16.PRODUCT_ID_AT]
-        if product != vlp16.PRODUCT_ID:
-            name = vlp16.OTHER_PRODUCTS.get(product, f"an unknown model (product id 0x{product:02x})")
+    def _checked(self, datagram: Datagram) -> AnyFormat:
+        """The format of a data packet. LinkError for another sensor's."""
+        form = self._form or packet_format("VLP-16")
+        reason = form.reject_reason(datagram.payload)
+        if reason in (PacketRejectReason.MODEL, PacketRejectReason.UNIT):
+            name = form.other_model(datagram.payload) or "an unknown model"
+            wanted = f", not a {form.profile.model}" if self._form else ", which grd does not know"
             raise LinkError(
-                f"{self._source}: the packet at byte {datagram.offset} is from {name}, not a VLP-16:"
-                " its beams have other elevations, so that every point would be wrong. Import a VLP-16's capture"
+                f"{self._source}: the packet at byte {datagram.offset} is from {name}{wanted}:"
+                " its beams have other elevations, so that every point would be wrong. Give its own rig with --rig"
             )
+        return form
 
 
 class _TelemetryLog(_ImportedFile):
     """The MAVLink frames of a telemetry log."""
 
     def __init__(self, stream: IO[bytes], source: Path) -> None:
-        self._data = stream.read()
+        self._stream = stream
         self._source = source
         self._report = TlogReport()
 
     def records(self) -> Iterator[Record]:
-        for time_ns, frame in read_frames(self._data, self._source, self._report):
+        for time_ns, frame in read_frames(self._stream, self._source, self._report):
             yield Record(_AUTOPILOT, time_ns, time_ns, frame)
 
     def done_bytes(self) -> int:
@@ -243,4 +271,4 @@ class _TelemetryLog(_ImportedFile):
         return self._report.warnings
 
     def nothing_found(self) -> str:
-        return f"{self._source}: no MAVLink frame in {len(self._data)} bytes: is it a telemetry log (.tlog)?"
+        return f"{self._source}: no MAVLink frame in {self._report.done_bytes} bytes: is it a telemetry log (.tlog)?"

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import struct
 import zlib
-from importlib.metadata import PackageNotFoundError, version
 from typing import IO
 
 import zstandard
@@ -32,6 +31,7 @@ from mcap.records import (
 from mcap.writer import MCAP0_MAGIC
 
 from flow.link import Record
+from links import __version__
 from links.recording.format import FORMAT_VERSION, MAX_TIME_NS, METADATA_FORMAT, METADATA_USER, PROFILE, topic
 
 CHUNK_BYTES = 2**20  # a chunk is closed at this size [uncompressed]
@@ -97,7 +97,7 @@ class McapFile:
 
         start = RecordBuilder()
         start.write(MCAP0_MAGIC)
-        Header(PROFILE, f"grd {_grd_version()}").write(start)
+        Header(PROFILE, f"grd {__version__}").write(start)
         self._put(start.end())
         self.add_metadata(METADATA_FORMAT, {"format_version": "{}.{}".format(*FORMAT_VERSION)})
         if metadata:
@@ -264,10 +264,3 @@ _INDEX_OPCODES = {
     AttachmentIndex: Opcode.ATTACHMENT_INDEX,
     MetadataIndex: Opcode.METADATA_INDEX,
 }
-
-
-def _grd_version() -> str:
-    try:
-        return version("grd")
-    except PackageNotFoundError:
-        return "(not installed)"

@@ -1,7 +1,8 @@
 """MAVLink frames of a telemetry log: an 8-byte big-endian time [us since 1970] before each frame, nothing else.
 
 A frame is accepted when its checksum is correct, or when a time and a frame follow its end (a message that is unknown
-or different in our dialect). All other bytes are skipped and counted.
+or different in our dialect). All other bytes are skipped and counted. A log is read block by block: it may be larger
+than the memory.
 
 Source: https://mavlink.io/en/guide/serialization.html (frames, CRC); pymavlink's mavlogfile (the log's layout).
 """
@@ -13,13 +14,17 @@ import functools
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import IO
 
+BLOCK_BYTES = 1 << 20
 _STAMP_BYTES = 8
 _V1, _V2 = 0xFE, 0xFD
 _V1_EXTRA_BYTES, _V2_EXTRA_BYTES, _SIGNATURE_BYTES = 8, 12, 13
 _SIGNED = 0x01  # v2 incompatibility flag
 _MAX_STAMP_US = 4_102_444_800_000_000  # the year 2100
 _MAX_STEP_US = 3 * 24 * 3600 * 1_000_000  # between neighbours without a correct checksum
+_MAX_FRAME_BYTES = 255 + _V2_EXTRA_BYTES + _SIGNATURE_BYTES
+_AHEAD_BYTES = 2 * _STAMP_BYTES + _MAX_FRAME_BYTES + 3  # what is needed to accept a frame: its own, and the next start
 _REVERSED = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
 
 
@@ -39,26 +44,31 @@ def looks_like_tlog(data: bytes) -> bool:
     return _frame_end(data, 0) is not None
 
 
-def read_frames(data: bytes, path: Path, report: TlogReport) -> Iterator[tuple[int, bytes]]:
+def read_frames(stream: IO[bytes], path: Path, report: TlogReport) -> Iterator[tuple[int, bytes]]:
     """(time in ns, frame) in file order; `report` counts what is not a frame."""
-    offset = 0
+    data, start, offset = b"", 0, 0  # a window of the file, its first byte, and the position in it
     bad_from: int | None = None
-    while offset < len(data):
+    while True:
+        while len(data) - offset < _AHEAD_BYTES and (block := stream.read(BLOCK_BYTES)):
+            data, start, offset = data[offset:] + block, start + offset, 0
+        if offset == len(data):
+            break
         end = _frame_end(data, offset)
         known = end is not None and _checksum_fits(data[offset + _STAMP_BYTES : end])
         if end is None or not (known or _follows(data, offset, end)):
-            bad_from = offset if bad_from is None else bad_from
+            bad_from = start + offset if bad_from is None else bad_from
             offset += 1
+            report.done_bytes = start + offset
             continue
         if bad_from is not None:
-            _note_bad(report, bad_from, offset)
+            _note_bad(report, bad_from, start + offset)
             bad_from = None
         report.unknown_checksum += not known
-        report.done_bytes = end
+        report.done_bytes = start + end
         yield _stamp_us(data, offset) * 1000, data[offset + _STAMP_BYTES : end]
         offset = end
     if bad_from is not None:
-        _note_bad(report, bad_from, len(data))
+        _note_bad(report, bad_from, start + len(data))
     if report.bad_bytes:
         runs = ", ".join(f"{start} to {start + length - 1}" for start, length in report.bad_runs)
         report.warnings.append(f"{path}: {report.bad_bytes} bytes are no MAVLink frame (bytes {runs}, ...): left out")

@@ -40,6 +40,7 @@ class RunStatus:
     elapsed_s: float
     report: Callable[[], LiveReport]  # on demand: it takes some milliseconds of every thread
     new_events: list[str]
+    used: str = ""  # memory, processor, disk
 
 
 ShowStatus = Callable[[RunStatus], None]
@@ -80,7 +81,7 @@ def run_live(
         live_since_s, usage = time.monotonic(), Usage()
         try:
             while not stop.wait(POLL_S) and (for_s is None or time.monotonic() < live_since_s + for_s):
-                _show(live, live_since_s, show, run)
+                _show(live, live_since_s, show, run, usage.now(folder))
                 usage.sample(live.processes)
         finally:
             report = live.stop()
@@ -89,12 +90,12 @@ def run_live(
         return run.finish(report, digest.hexdigest(), None, [], usage)
 
 
-def _show(live: Live, live_since_s: float, show: ShowStatus, run: RunFolder) -> None:
+def _show(live: Live, live_since_s: float, show: ShowStatus, run: RunFolder, used: str = "") -> None:
     new_events = live.events.fetch()
     for text in new_events:
         run.note(text)
     try:
-        show(RunStatus(time.monotonic() - live_since_s, live.report, new_events))
+        show(RunStatus(time.monotonic() - live_since_s, live.report, new_events, used))
     except (OSError, SystemExit) as error:  # the output is full or closed; rich exits on a broken pipe
         reason = error if isinstance(error, OSError) else "the pipe is closed"
         live.events.report("run", f"cannot write to the terminal ({reason}); the run continues, see run.log")

@@ -15,11 +15,8 @@ from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import yaml
-
-from flow.config_error import Location
+from flow.config.yaml_text import YamlTextError, yaml_values
 from flow.graph import load_graph
 from flow.link import TRUTH_TOPICS, LinkError, Tap
 from flow.replay import replay
@@ -112,9 +109,7 @@ def measure(pins: list[Pin], jobs: int) -> Iterator[PinResult]:
 def output_hash(recording: Path, config: Path) -> str:
     """Replay a recording through a configuration without its taps, in one process, every array checked."""
     session = Session(recording)
-    sections = None
-    if session.rig_yaml is not None:
-        sections = {"rig": (yaml.safe_load(session.rig_yaml), Location(f"{recording} (rig.yaml)", 0))}
+    sections = None if session.rig_yaml is None else {"rig": (session.rig_yaml, f"{recording} (rig.yaml)")}
     graph = load_graph(config, [], _without_taps(config), sections)
     digest = Digest()
     records = (record for record in session.records() if not record.topic.startswith(TRUTH_TOPICS))
@@ -129,8 +124,11 @@ def _without_taps(config: Path) -> list[str]:
 
 
 def _has_cameras(recording: Path) -> bool:
-    rig: Any = yaml.safe_load(Session(recording).rig_yaml or "") or {}
-    return bool(rig.get("cameras"))
+    try:
+        rig = yaml_values(Session(recording).rig_yaml or "")
+    except YamlTextError as error:
+        raise LinkError(f"{recording} (rig.yaml): {error}") from None
+    return isinstance(rig, dict) and bool(rig.get("cameras"))
 
 
 def _read(file: Path) -> dict[str, dict[str, str]]:

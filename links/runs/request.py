@@ -8,12 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import yaml
-
-from flow.config.tree import Section
-from flow.config_error import Location
 from flow.graph import Graph, load_graph
-from flow.link import LinkError
 from flow.replay import RunReport
 from links.runs.results import Results
 from links.runs.truth import FixErrors
@@ -31,15 +26,9 @@ class RunRequest:
     def graph(self, rig_yaml: str | None, where: str) -> Graph:
         """The graph on the rig `rig_yaml`, read from `where`, or (None) on the rig of the configuration.
 
-        Raises ConfigError for the configuration, LinkError for the rig.
+        Raises ConfigError for both.
         """
-        sections: dict[str, Section] | None = None
-        if rig_yaml is not None:
-            location = Location(where, 0)
-            try:
-                sections = {"rig": (yaml.safe_load(rig_yaml), location)}
-            except yaml.YAMLError as error:
-                raise LinkError(f"{location} is not YAML: {str(error).splitlines()[0]}") from None
+        sections = None if rig_yaml is None else {"rig": (rig_yaml, where)}
         return load_graph(self.config, self.overlays, self.sets, sections)
 
 

@@ -22,6 +22,7 @@ from flow.replay import RunReport, replay
 from flow.stage import Stage
 from flow.subprocess_replay import can_use_subprocesses, replay_in_subprocesses
 from flow.taps import Digest
+from links.lidar import Lidar, recorded_lidars
 from links.mavlink.autopilot import Autopilot
 from links.recording import Progress, Session
 from links.runs.request import RunRequest, RunResult
@@ -30,7 +31,6 @@ from links.runs.results import SUMMARY_FILE, Results
 from links.runs.summary import summary
 from links.runs.truth import TruthLog, read_truth_file
 from links.runs.usage import Usage
-from links.velodyne import Lidar, recorded_lidars
 from stages.messages import Detections, DroneFix, RelativePose
 
 CONFIG_FILE = "config.yaml"
@@ -57,9 +57,11 @@ class RunFolder:
         self._folder, self._recording, self._request, self._graph = folder, recording, request, graph
         self._live = live
         self._started_s = time.monotonic() if started_s is None else started_s
-        self._results, self._open = Results(**_gate(graph)), ExitStack()
+        gate = _gate(graph)
+        self._results, self._open = Results(**gate), ExitStack()
         declared = [spec.build() for spec in graph.nodes.values() if issubclass(spec.cls, Tap)]
         self.taps: list[Tap] = [self._results, *(tap for tap in declared if isinstance(tap, Tap))]
+        self._viewers = _viewers(self.taps, gate)
 
     def __enter__(self) -> RunFolder:
         self._folder.mkdir(parents=True, exist_ok=True)
@@ -106,6 +108,9 @@ class RunFolder:
         warnings = [*warnings, *_remarks(self._graph, report)]
         for text in (*warnings, f"output hash {output_hash}"):
             self.note(text)
+        if truth is not None:
+            for viewer in self._viewers:
+                viewer.truths = [truth.drone_in_vehicle(number) for number in sorted(truth.drones)]
         self._open.close()
         if truth is None:
             truth = read_truth_file(self._recording)
@@ -138,6 +143,19 @@ def _stage_outputs(graph: Graph, report: RunReport) -> str:
             return ""
         counts[node].append(f"{report.messages.get(f'{node}.{output}', 0)} {output}")
     return "; ".join(f"{n} ({graph.nodes[n].cls.__name__}: {', '.join(c) or 'no output'})" for n, c in counts.items())
+
+
+def _viewers(taps: list[Tap], gate: dict[str, Any]) -> list[Any]:
+    """The viewers among the taps, with the gate's settings. Rerun is imported only where a graph has taps."""
+    if len(taps) == 1:
+        return []
+    from links.viewer import Viewer
+    from links.viewer.scene import Gate
+
+    viewers = [tap for tap in taps if isinstance(tap, Viewer)]
+    for viewer in viewers:
+        viewer.gate = Gate(**gate) if gate else None
+    return viewers
 
 
 def _gate(graph: Graph) -> dict[str, Any]:

@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import resource
 from dataclasses import asdict
-from importlib.metadata import version
 from typing import Any
 
+from flow.config.secrets import without_secrets
 from flow.live.report import LiveReport
+from links import __version__
 from links.runs.request import RunRequest, RunResult
 from links.runs.results import stamp_s
 from links.runs.truth import FixErrors
@@ -21,12 +22,12 @@ def summary(run: RunResult, request: RunRequest) -> dict[str, Any]:
     """The values of `summary.json`, in the order of the file."""
     report, results = run.report, run.results
     values: dict[str, Any] = {
-        "grd": version("grd"),
+        "grd": __version__,
         "recording": run.recording.name,
         **({"parts": run.parts} if run.parts is not None and run.parts > 1 else {}),
         "config": request.config.name,
         "overlays": [path.name for path in request.overlays],
-        "set": list(request.sets),
+        "set": [without_secrets(text) for text in request.sets],
         "output_hash": run.output_hash,
         "records": report.records,
         "start_s": stamp_s(report.first_ns),

@@ -9,7 +9,9 @@ Source: ours; proc(5), /proc/PID/statm, /proc/PID/stat and /proc/self/fd.
 
 from __future__ import annotations
 
+import contextlib
 import os
+import shutil
 import threading
 import time
 from collections.abc import Iterable
@@ -53,6 +55,18 @@ class Usage:
         if len(self.columns["elapsed_s"]) >= MAX_SAMPLES:
             self._period_s *= 2
             self.columns = {name: column[::2] for name, column in self.columns.items()}
+
+    def now(self, folder: Path) -> str:
+        """`512 MB of memory, 130 % of a core, 41 GB free`: of the newest samples, and the disk of a folder."""
+        texts: list[str] = []
+        if times := self.columns["elapsed_s"]:
+            texts.append(f"{self.columns['rss_mb'][-1]:.0f} MB of memory")
+            if len(times) > 1:
+                cpu_s = self.columns["cpu_s"][-1] - self.columns["cpu_s"][-2]
+                texts.append(f"{100 * cpu_s / (times[-1] - times[-2]):.0f} % of a core")
+        with contextlib.suppress(OSError):
+            texts.append(f"{shutil.disk_usage(folder).free / 1e9:.0f} GB free")
+        return ", ".join(texts)
 
     def __str__(self) -> str:
         """First, middle and last sample; empty without samples."""

@@ -15,8 +15,9 @@ from flow.link import TRUTH_TOPICS, LinkError
 from flow.ports import RunError
 from flow.replay import Replay
 from links.recording import Progress, RecordingReader
+from links.runs.shipped import RECORDINGS
 
-RECORDING = Path(__file__).resolve().parents[2] / "recordings" / "experiment_1.mcap"
+RECORDING = RECORDINGS / "experiment_1.mcap"
 
 
 def warm_up(graph: Graph, progress: Progress, recording: Path = RECORDING) -> str | None:

@@ -3,7 +3,7 @@
 Source: ours.
 """
 
-from links.simulated.rig.fix_source import SimulatedFixes
+from links.simulated.pose_sensors.pose_source import SimulatedFixes, SimulatedRotations
 from links.simulated.rig.live_rig import LiveRig
 
-__all__ = ["LiveRig", "SimulatedFixes"]
+__all__ = ["LiveRig", "SimulatedFixes", "SimulatedRotations"]

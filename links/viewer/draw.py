@@ -9,7 +9,7 @@ Entity paths consist of a group, the output (`vehicle/sweep/swept_points`) and t
 | depth/, score/, range/, overlays/ | images, and overlays on them                                     |
 | camera/                           | per camera: its image, and the detections in it                  |
 | sphere/                           | directions, on the unit spheres of vehicle and drone             |
-| plots/                            | curves, per quantity                                             |
+| plots/                            | curves, per quantity; plots/fields: numbers of all other messages |
 | states/                           | state lanes                                                      |
 | log/, status, candidates, about/  | text log, current status, reasons per candidate, graph and settings |
 
@@ -40,6 +40,7 @@ from stages.messages import (
     DroneFix,
     DroneMotion,
     FollowedFeatures,
+    HeadingEstimate,
     Image,
     LidarFirings,
     RelativePose,
@@ -90,6 +91,7 @@ draw.register(FollowedFeatures)(draw_cameras.followed_features)
 draw.register(RelativeRotation)(draw_pose.relative_rotation)
 draw.register(VisualMotion)(draw_pose.visual_motion)
 draw.register(RelativePose)(draw_pose.relative_pose)
+draw.register(HeadingEstimate)(draw_pose.heading_estimate)
 draw.register(AutopilotEstimator)(draw_pose.autopilot_estimator)
 draw.register(ServoOffset)(draw_pose.servo_offset)
 
@@ -103,10 +105,10 @@ def _draw_field(value: Any, name: str, scene: ViewerScene) -> Entities:
         if scene.changed(name, str(value)):
             yield log_entry(name, str(value))
     elif isinstance(value, bytes):
-        yield plot(f"plots/other/{name}", [len(value)], [f"{name} bytes"])
+        yield plot(f"plots/fields/{name}", [len(value)], [f"{name} bytes"])
     elif 0 < np.size(value) <= 9:
         names = [name] if np.size(value) == 1 else [f"{name} {i}" for i in range(np.size(value))]
-        yield plot(f"plots/other/{name}", np.ravel(value).astype(np.float64), names)
+        yield plot(f"plots/fields/{name}", np.ravel(value).astype(np.float64), names)
     elif np.ndim(value) == 2 and np.shape(value)[1] == 3 and name.endswith("_vehicle_m"):
         shown = value[thin(np.asarray(value, dtype=np.float32), scene.max_points)]
         yield Entity(f"vehicle/{name}", rr.Points3D(shown, colors=colours.NEUTRAL), frame="vehicle")
@@ -114,4 +116,4 @@ def _draw_field(value: Any, name: str, scene: ViewerScene) -> Entities:
         finite = np.asarray(value, dtype=np.float64)
         finite = finite[np.isfinite(finite)]
         summary = [finite.size, finite.min(), finite.mean(), finite.max()] if finite.size else [0, 0, 0, 0]
-        yield plot(f"plots/other/{name}", summary, [f"{name} {w}" for w in ("finite", "min", "mean", "max")])
+        yield plot(f"plots/fields/{name}", summary, [f"{name} {w}" for w in ("finite", "min", "mean", "max")])

@@ -29,7 +29,8 @@ from stages.geometry.frames import Array64
 from stages.messages import CandidateEvidence, Candidates, Detections, DroneFix, KernelScores, TrackingState, TrackState
 
 RING_PX = 14.0  # radius of the ring around a candidate in the images
-PROBABILITY_COLOURS = np.array([colours.CANDIDATE, colours.NEUTRAL], dtype=np.uint32)
+MAX_LABELS = 3  # of the most probable candidates
+PROBABILITY_COLOURS = np.array([colours.CANDIDATE, colours.NEUTRAL, colours.GOOD], dtype=np.uint32)
 DETECTION_COLOURS = np.array([colours.ACCEPTED, colours.REJECTED | 0xFF], dtype=np.uint32)
 HITS_COLOURS = np.array([colours.DRONE], dtype=np.uint32)
 PREDICTED_COLOURS = {
@@ -40,7 +41,7 @@ PREDICTED_COLOURS = {
 
 
 def candidates(message: Candidates, name: str, scene: ViewerScene) -> Entities:
-    """Points coloured by probability, the reasons for each candidate, and a log entry for each removed candidate."""
+    """Points coloured by fate (followed, accepted, else by probability), reasons, an entry for each removed one."""
     for number, last in scene.removed_candidates(name, message):
         unseen_s = (message.stamp_ns - last.seen_ns) * 1e-9
         text = f"candidate {number} removed at {_percent(last.probability)}, no return for {unseen_s:.1f} s"
@@ -48,17 +49,24 @@ def candidates(message: Candidates, name: str, scene: ViewerScene) -> Entities:
     xyz_m, packed = message.xyz_vehicle_m, colours.by_probability(message.probability)
     heads = [f"{number}: {_percent(p)}" for number, p in zip(message.candidate_id, message.probability, strict=True)]
     full = [f"candidate {head}, {reason}" for head, reason in zip(heads, message.reasons, strict=True)]
-    dots = rr.Points3D(xyz_m, colors=packed, radii=rr.Radius.ui_points(5.0), labels=full, show_labels=False)
+    followed, accepted = scene.followed(xyz_m), message.probability >= message.accept_probability
+    packed = np.where(accepted, np.uint32(colours.ACCEPTED), packed).astype(np.uint32)
+    packed = np.where(followed, np.uint32(colours.DRONE), packed).astype(np.uint32)
+    radii = rr.Radius.ui_points(np.where(followed, 9.0, 5.0))
+    dots = rr.Points3D(xyz_m, colors=packed, radii=radii, labels=full, show_labels=False)
     yield Entity(f"vehicle/{name}", dots, frame="vehicle")
-    unlabelled = ~scene.near_a_drone(xyz_m)  # a tracked drone has its own label
-    yield label(
-        name,
-        xyz_m[unlabelled],
-        [head for head, wanted in zip(heads, unlabelled, strict=True) if wanted],
-        packed[unlabelled],
-    )
+    labelled = np.argsort(-message.probability, kind="stable")[:MAX_LABELS]
+    labelled = np.union1d(labelled, np.flatnonzero(followed))
+    labelled = labelled[~scene.near_a_drone(xyz_m[labelled])]  # a tracked drone has its own label
+    texts = [f"{heads[i]}, followed" if followed[i] else heads[i] for i in labelled]
+    yield label(name, xyz_m[labelled], texts, packed[labelled])
     best = [*np.sort(100.0 * message.probability)[::-1], 0.0, 0.0]
-    yield plot(f"plots/probability/{name}", best[:2], ["most probable candidate", "second"], PROBABILITY_COLOURS)
+    yield plot(
+        f"plots/probability/{name}",
+        [*best[:2], 100.0 * message.accept_probability],
+        ["most probable candidate", "second", "accepted from here on"],
+        PROBABILITY_COLOURS,
+    )
     rows = [
         f"{head}, last return {(message.stamp_ns - seen_ns) * 1e-9:.1f} s ago at {_xyz(xyz)} m: {reason}"
         for head, seen_ns, xyz, reason in zip(heads, message.seen_ns, xyz_m, message.reasons, strict=True)
@@ -81,10 +89,11 @@ def detections(message: Detections, name: str, scene: ViewerScene) -> Entities:
         labels = [f"candidate {numbers[k]}, {confidence[k]}: {message.reasons[k]}" for k in np.flatnonzero(chosen)]
         points = rr.Points3D(xyz_m, colors=colour, radii=rr.Radius.ui_points(5.0), labels=labels, show_labels=False)
         yield Entity(f"vehicle/{name}/{kind}", points, frame="vehicle")
+        heads = [text.split(",")[0] for text in labels]
         if scene.depth is not None:
-            yield _rings(scene, f"overlays/{name}/{kind}", xyz_m, labels, colour, show_labels=kind == "accepted")
+            yield _rings(scene, f"overlays/{name}/{kind}", xyz_m, heads, colour, show_labels=kind == "accepted")
         if kind == "accepted" and isinstance(evidence, KernelScores):  # else Candidates draws its current position
-            yield label(name, xyz_m, [text.split(",")[0] for text in labels], colour)
+            yield label(name, xyz_m, heads, colour)
     if isinstance(evidence, CandidateEvidence):
         percent = 100.0 * evidence.probability
         best = [percent[chosen].max(initial=0.0) for chosen in (message.accepted, ~message.accepted)]
@@ -108,6 +117,7 @@ def drone_fix(message: DroneFix, name: str, scene: ViewerScene) -> Entities:
     scene.fixes[name, message.track_id] = message
     if message is next(iter(scene.fixes.values())):  # the close-up follows the first drone of the first tracker
         yield Entity(f"frames/{DRONE_FRAME}", drone_transform(xyz_m))
+    scene.estimated(name, message.stamp_ns, xyz_m, message.covariance_m2)
     covariance_m2 = message.covariance_m2[None]
     ellipsoid_path = f"vehicle/{path}/ellipsoid_95"
     yield ellipsoids(ellipsoid_path, xyz_m[None], covariance_m2, colours.DRONE_TRANSLUCENT, filled=True)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from links.viewer import colours
 from links.viewer.entities import Entities, Entity, plot, stage_of, state_change, state_path
 from links.viewer.message_queue import thin
-from links.viewer.scene import ViewerScene, turntable_transform
+from links.viewer.scene import ViewerScene, beam_fan, turntable_transform
 from stages.messages import (
     DepthImage,
     DroneMotion,
@@ -32,21 +32,20 @@ from stages.messages import (
 
 SERVO_COLOURS = np.array([colours.NEUTRAL, colours.FAN | 0xFF], dtype=np.uint32)
 GOAL_COLOUR = np.array([colours.DRONE], dtype=np.uint32)
-STEP_M = 0.002  # one count of the u16 images, the VLP-16's own resolution
+STEP_M = 0.002  # one count of the u16 images: the resolution of a VLP-16
 COLUMNS = 900  # of the range image: 0.4 deg, the spacing of firings at 20 turns a second
-
-# VLP-16 user manual 63-9243, table 9-1: elevation of the 16 lasers in the packet's order.
-ELEVATION_DEG = np.array([-15, 1, -13, 3, -11, 5, -9, 7, -7, 9, -5, 11, -3, 13, -1, 15])
-ROW_OF_LASER = (15 - ELEVATION_DEG) // 2  # top row: the highest beam
 
 
 def lidar_firings(message: LidarFirings, name: str, scene: ViewerScene) -> Entities:
-    """The range image and the number of lost packets.
+    """The range image, the fan of the beams and the number of lost packets.
 
-    The image is a tensor, because a tensor view stretches 16 rows to a readable height.
+    The image is a tensor, because a tensor view stretches few rows to a readable height.
     """
     counts = range_counts(message)
     yield Entity(f"range/{name}", rr.Tensor(counts, dim_names=("laser", "azimuth"), value_range=(0.0, 60.0 / STEP_M)))
+    lowest, highest = float(message.laser_elevation_rad.min()), float(message.laser_elevation_rad.max())
+    if scene.mount is not None and scene.changed("lidar/fan", f"{lowest} {highest}"):
+        yield beam_fan(lowest, highest)
     yield plot(f"plots/other/{name}/lost_packets", [message.lost_packets], [f"{name} lost packets"])
     yield from state_change(state_path(name), "packets lost" if message.lost_packets else "ok", scene)
 
@@ -75,14 +74,14 @@ def swept_points(message: SweptPoints, name: str, scene: ViewerScene) -> Entitie
     index = message.stamp_ns // scene.slice_ns % scene.slices
     points = rr.Points3D(xyz_m, colors=scene.colours(xyz_m), radii=rr.Radius.ui_points(1.2))
     yield Entity(f"vehicle/{name}/slice_{index:02d}", points, frame="vehicle")
-    yield plot(f"plots/other/{name}", [message.pulses, len(message.xyz_vehicle_m)], ["pulses", "returns"])
+    yield plot(f"plots/count/{name}", [message.pulses, len(message.xyz_vehicle_m)], ["pulses", "returns"])
 
 
 def swept_pulses(message: SweptPulses, name: str, scene: ViewerScene) -> Entities:
     """The number of pulses and the share without a return; points and range image show their geometry."""
     del scene
     count = message.range_m.size
-    yield plot(f"plots/other/{name}/pulses", [count], ["pulses placed"])
+    yield plot(f"plots/count/{name}/pulses", [count], ["pulses placed"])
     if count:
         empty = 100.0 * (count - np.count_nonzero(message.range_m)) / count
         yield plot(f"plots/other/{name}/empty", [empty], ["pulses without return [%]"])
@@ -119,7 +118,7 @@ def depth_image(message: DepthImage, name: str, scene: ViewerScene) -> Entities:
     yield Entity(f"depth/{name}", rr.DepthImage(pixels, meter=1.0 / STEP_M, colormap=colormap, depth_range=(0.0, far)))
     yield Entity("overlays/axes", _vehicle_axes(message))
     counts = [message.points, message.returns]
-    yield plot(f"plots/other/{name}", counts, ["returns in image", "returns of sweep"])
+    yield plot(f"plots/count/{name}", counts, ["returns in image", "returns of sweep"])
     text = f"{message.points} of {message.returns} returns are inside the depth image"
     yield scene.status(1, stage_of(name), text)
 
@@ -133,10 +132,11 @@ def score_image(message: ScoreImage, name: str, scene: ViewerScene) -> Entities:
 
 def range_counts(firings: LidarFirings) -> NDArray[np.uint16]:
     """Range by laser (rows, highest beam on top) and azimuth (columns, 0 along +y_lidar); the newest return wins."""
-    image = np.zeros((16, COLUMNS), dtype=np.uint16)
+    row_of_laser = np.argsort(np.argsort(-firings.laser_elevation_rad))
+    image = np.zeros((len(row_of_laser), COLUMNS), dtype=np.uint16)
     hit = (firings.range_m > 0) & (firings.return_kind == 0)
     column = (firings.azimuth_rad[hit] / (2 * np.pi) * COLUMNS).astype(np.int64) % COLUMNS
-    image[ROW_OF_LASER[firings.laser[hit] % 16], column] = _counts(firings.range_m[hit])
+    image[row_of_laser[firings.laser[hit]], column] = _counts(firings.range_m[hit])
     return image
 
 

@@ -45,6 +45,7 @@ _STATE_COLOURS = {
     "moves": colours.GOOD,
     "no motion": colours.NEUTRAL,
     "FULL": colours.GOOD,
+    "accepted": colours.GOOD,
     "POSITION_ONLY": colours.CANDIDATE,
     "fused": colours.GOOD,
     "not fused": colours.BAD,

@@ -30,7 +30,7 @@ JOINED: dict[type[Message], tuple[str, ...]] = {
     SweptPoints: ("pulses", "unplaced"),
     SweptPulses: (),
 }
-"""Message types that arrive per packet, with the fields to sum; their arrays are concatenated."""
+"""Message types that arrive per packet, with the fields to sum; their arrays with a row per point are concatenated."""
 
 
 class MessageQueue(Generic[T]):
@@ -90,7 +90,8 @@ def join(messages: Sequence[Message]) -> Message:
     first = messages[0]
     changes: dict[str, Any] = {
         name: np.concatenate([getattr(message, name) for message in messages])
-        for name, _, _ in array_fields(type(first))
+        for name, _, shape in array_fields(type(first))
+        if shape.dims[0] == "n"
     }
     for name in JOINED[type(first)]:
         changes[name] = sum(getattr(message, name) for message in messages)

@@ -13,6 +13,8 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from links.mavlink.poses.gate import PoseLimits
+from links.mavlink.profiles import YawOutput
 from links.viewer import colours
 from links.viewer.entities import Entities, Entity, stage_of
 from links.viewer.lenses import Cameras
@@ -24,11 +26,11 @@ DRONE_FRAME = "drone_position"  # axes of the vehicle, origin at the latest fix;
 FAN_RADIUS_M = 12.0
 SPHERE_SPACING = 2.8  # distance of the unit spheres of vehicle and drone [radii]
 NEAR_DRONE_M = 1.0
+MAX_ESTIMATES = 200_000  # of an output: an hour at 50 Hz
 TURNTABLE_PERIOD_NS = 20_000_000
 HYPOTHESIS_TIMEOUT_NS = 150_000_000  # a tracker reports each hypothesis ten times a second
 STATE_TIMEOUT_NS = 1_000_000_000
 STATE_PRIORITY = (TrackingState.TRACKING, TrackingState.COASTING, TrackingState.CANDIDATE)
-FAN_HALF_OPENING_RAD = np.deg2rad(15.0)  # VLP-16 user manual 63-9243: beams from -15 to +15 deg
 
 
 class LastCandidate(NamedTuple):
@@ -37,6 +39,21 @@ class LastCandidate(NamedTuple):
     probability: float
     seen_ns: int
     reason: str
+
+
+class Gate(NamedTuple):
+    """The autopilot link's gate: which poses it sends."""
+
+    limits: PoseLimits
+    yaw: YawOutput
+
+
+class Estimate(NamedTuple):
+    """An estimated position of the drone."""
+
+    stamp_ns: int
+    xyz_vehicle_m: Array64  # (3,)
+    sigma_m: float  # one sigma, 3D
 
 
 class LoggedImage(NamedTuple):
@@ -65,11 +82,15 @@ class ViewerScene:
         trail_s: float,
         cameras: Cameras | None = None,
         image_period_s: float = 0.0,
+        gate: Gate | None = None,
     ):
+        """`gate`: of the autopilot link; None: nothing is sent to an autopilot."""
         self.mount = mount
         self.cameras = cameras or Cameras()
         self.images: dict[str, LoggedImage] = {}  # by frame id, the last one logged
         self._image_period_ns = int(image_period_s * 1e9)
+        self.gate = gate
+        self.estimates: dict[str, deque[Estimate]] = {}  # by output, for the errors against the truth
         self.max_points = max_points
         self.trail_s = trail_s
         self.slice_ns = int(slice_s * 1e9)
@@ -90,6 +111,20 @@ class ViewerScene:
             return False
         self._last_values[path] = value
         return True
+
+    def estimated(self, name: str, stamp_ns: int, xyz_vehicle_m: Array64, covariance_m2: Array64) -> None:
+        """Store an estimated position of the drone of an output."""
+        estimates = self.estimates.setdefault(name, deque(maxlen=MAX_ESTIMATES))
+        estimates.append(Estimate(stamp_ns, xyz_vehicle_m, math.sqrt(float(covariance_m2.trace()))))
+
+    def followed(self, xyz_m: Array64) -> NDArray[np.bool_]:
+        """Mask (n,) of the points (n, 3) within 1 m of a drone or of a hypothesis that the tracker follows."""
+        near = self.near_a_drone(xyz_m)
+        for hypotheses in self._hypotheses.values():
+            for track in hypotheses:
+                if track.xyz_vehicle_m is not None:
+                    near |= np.linalg.norm(xyz_m - track.xyz_vehicle_m, axis=1) < NEAR_DRONE_M
+        return near
 
     def has_value(self, path: str) -> bool:
         """Whether a value is stored under `path`."""
@@ -197,7 +232,7 @@ class ViewerScene:
 
 
 def static_entities(mount: LidarMount | None) -> Entities:
-    """Static entities: the vehicle's axes and, with a mount, the LiDAR's frame and the fan of its beams."""
+    """Static entities: the vehicle's axes and, with a mount, the LiDAR's frame."""
     axes = rr.Arrows3D(vectors=np.diag([5.0, 2.5, 2.5]), colors=colours.AXES, radii=rr.Radius.ui_points(2.0))
     yield Entity("vehicle/axes", axes, frame="vehicle")
     labels = ["vehicle", "forward"]
@@ -207,12 +242,15 @@ def static_entities(mount: LidarMount | None) -> Entities:
         return
     lidar = mount.T_turntable_lidar.matrix()
     yield Entity("frames/lidar", _transform(lidar, "turntable", "lidar"))
+
+
+def beam_fan(lowest_rad: float, highest_rad: float) -> Entity:
+    """Circles at the elevations of the lowest and the highest beam."""
     turn = np.linspace(0, 2 * np.pi, 73)
     circle = np.stack([np.sin(turn), np.cos(turn), np.zeros_like(turn)], axis=1)
-    c, s = np.cos(FAN_HALF_OPENING_RAD), np.sin(FAN_HALF_OPENING_RAD)
-    edges = [FAN_RADIUS_M * (c * circle + [0, 0, s * side]) for side in (-1, 1)]
+    edges = [FAN_RADIUS_M * (math.cos(w) * circle + [0, 0, math.sin(w)]) for w in (lowest_rad, highest_rad)]
     fan = rr.LineStrips3D(edges, colors=colours.FAN, radii=rr.Radius.ui_points(1.0))
-    yield Entity("lidar/fan", fan, frame="lidar")
+    return Entity("lidar/fan", fan, frame="lidar")
 
 
 def initial_frames(mount: LidarMount | None) -> Entities:

@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 from rerun.experimental import ViewerClient, ViewerState
 
+from flow.config_error import one_of
 from flow.link import LinkError
 from links.viewer.scene import TIMELINE
 from links.viewer.stream import LOOPBACK
@@ -36,10 +37,14 @@ class ViewerMissing(LinkError):
 def show(url_or_file: str | Path) -> subprocess.Popen[bytes]:
     """Open a viewer window on a serving run (`Viewer.url`) or on an .rrd file; it outlives this process.
 
-    Raises ViewerMissing when the window does not open.
+    Raises ViewerMissing when the window does not open, LinkError when there is no such file.
     """
     where = str(url_or_file)
-    target = ["--connect", where] if where.startswith("rerun+") else [where]
+    if where.startswith("rerun+"):
+        target = ["--connect", where]
+    else:
+        _check_file(Path(where))
+        target = [where]
     process = _start([*target, "--port", "auto"], new_session=True)
     try:
         process.wait(WINDOW_S)
@@ -52,14 +57,20 @@ def show(url_or_file: str | Path) -> subprocess.Popen[bytes]:
 
 
 def screenshot(
-    rrd: Path, png: Path, *, at: float = 0.9, size: str = "1920x1080", wait_s: float = NOTIFICATION_S
+    rrd: Path,
+    png: Path,
+    *,
+    at: float = 0.9,
+    size: str = "1920x1080",
+    wait_s: float = NOTIFICATION_S,
+    tab: str | None = None,
 ) -> list[str]:
     """Draw a recording off-screen, at fraction `at` of its duration, into a PNG. Returns the errors that views report.
 
+    `tab`: name of the tab to draw, such as Fusion; None: the first one.
     Raises ViewerMissing when there is no viewer or no graphics driver, LinkError when the viewer cannot load the file.
     """
-    if not rrd.is_file():
-        raise LinkError(f"{rrd}: no such file; `grd run` and `grd replay` write run.rrd into their folder")
+    _check_file(rrd)
     with _headless(rrd, size) as viewer:
         state = _wait_until_loaded(viewer, rrd)
         start, end, kind = _span(state, rrd)
@@ -68,12 +79,19 @@ def screenshot(
             viewer.set_time(TIMELINE, timestamp=np.datetime64(moment_ns, "ns"), play_state="paused")
         else:
             viewer.set_time(TIMELINE, duration=np.timedelta64(moment_ns, "ns"), play_state="paused")
+        if tab is not None:
+            _activate(viewer, tab)
         time.sleep(wait_s)
         png.write_bytes(viewer.take_screenshot())
         errors = _view_errors(viewer)
         for _ in _other_tabs(viewer):
             errors += _view_errors(viewer)
         return list(dict.fromkeys(errors))
+
+
+def _check_file(rrd: Path) -> None:
+    if not rrd.is_file():
+        raise LinkError(f"{rrd}: no such file; `grd run` and `grd replay` write run.rrd into their folder")
 
 
 def _view_errors(viewer: ViewerClient) -> list[str]:
@@ -85,11 +103,26 @@ def _view_errors(viewer: ViewerClient) -> list[str]:
     ]
 
 
+def _activate(viewer: ViewerClient, tab: str) -> None:
+    """Show the tab of this name. LinkError when there is none."""
+    read = viewer.get_blueprint()
+    containers = {
+        key: part["ContainerBlueprint"] for key, part in read.blueprint.items() if "ContainerBlueprint" in part
+    }
+    names = {container["display_name"]: key for key, container in containers.items() if "display_name" in container}
+    if tab not in names:
+        raise LinkError(f"no tab '{tab}'; there is {one_of(sorted(names))}")
+    for container in containers.values():
+        if "active_tab" in container and names[tab] in container.get("contents", []):
+            container["active_tab"] = names[tab]
+    viewer.set_blueprint(read.blueprint, "recording")
+
+
 def _other_tabs(viewer: ViewerClient) -> Iterator[int]:
     """Activate the second tab of every tab group, then the third, and so on; yields after each step."""
     read = viewer.get_blueprint()
     containers = [part["ContainerBlueprint"] for part in read.blueprint.values() if "ContainerBlueprint" in part]
-    groups = [container for container in containers if "active_tab" in container]
+    groups = [container for container in containers if "active_tab" in container and container.get("contents")]
     for index in range(1, max((len(group["contents"]) for group in groups), default=0)):
         for group in groups:
             group["active_tab"] = group["contents"][index % len(group["contents"])]

@@ -20,18 +20,21 @@ from pydantic import Field
 from flow.link import Run, Tap
 from flow.message import Message
 from flow.stage import Settings
+from links.viewer import draw_pose
 from links.viewer.draw import draw
+from links.viewer.draw_pose import TrueTrack
 from links.viewer.entities import Entity
 from links.viewer.layout import Vision, layout
 from links.viewer.lenses import Cameras
 from links.viewer.message_queue import MessageQueue, Slicer
-from links.viewer.scene import ViewerScene, drone_sphere, initial_frames, spheres, static_entities
+from links.viewer.scene import Gate, ViewerScene, drone_sphere, initial_frames, spheres, static_entities
 from links.viewer.stream import LOOPBACK, Stream
 from stages.geometry.frames import LidarMount
 from stages.messages import CameraMount
 
 PUT_TIMEOUT_S = 10.0  # a lossless run waits this long for a stalled viewer
 IMAGE_PERIOD_S = {True: 0.0, False: 0.2}  # lossless: every image; live: five per second
+TRUTH_PERIOD_NS = 50_000_000  # between drawn true positions
 CLOSE_TIMEOUT_S = {True: 60.0, False: 1.5}  # lossless: all messages; live: a run stops within two seconds
 
 # Errors of drawing a message, including those of Rerun in strict mode.
@@ -43,7 +46,7 @@ _log = logging.getLogger("grd.viewer")
 class ViewerSettings(Settings):
     """Settings of `Viewer`."""
 
-    file: str | None = "run.rrd"  # in the folder of the run; null: no file
+    file: str | None = Field("run.rrd", pattern=r"^[\w.-]+\.rrd$")  # in the folder of the run; null: no file
     serve: bool = False  # serve viewers on this host; binds 127.0.0.1 only
     port: int = Field(9876, ge=1024, le=65535)
     memory_limit: str = Field(
@@ -69,6 +72,10 @@ class Viewer(Tap[ViewerSettings]):
         self._errors: Counter[str] = Counter()
         self._finished: bool = False
         self._blocks: bool = False  # lossless, and not live
+        self.gate: Gate | None = None
+        """The autopilot link's gate, set before `open`."""
+        self.truths: list[TrueTrack] = []
+        """True positions of the drones, set before `close`; drawn at the end."""
 
     @property
     def dropped(self) -> dict[str, int]:
@@ -159,6 +166,8 @@ class Viewer(Tap[ViewerSettings]):
                 depth_images=_wired(run, "depth_image"),
                 candidates=_wired(run, "candidates"),
                 vision=vision,
+                truth=not run.live,
+                gate=self.gate is not None,
             ),
         )
         for entity in (*_about(run), *static_entities(settings.mount), *(spheres() if vision.directions else ())):
@@ -171,6 +180,7 @@ class Viewer(Tap[ViewerSettings]):
             trail_s=settings.trail_s,
             cameras=settings.cameras,
             image_period_s=IMAGE_PERIOD_S[self._blocks],
+            gate=self.gate,
         )
         initial = [*initial_frames(settings.mount), *(drone_sphere(None) if vision.directions else ())]
         slicer = Slicer(settings.slice_s)
@@ -182,7 +192,22 @@ class Viewer(Tap[ViewerSettings]):
                 dropped = queue.dropped.total()
                 stream.put(Entity("log/viewer", rr.TextLog(f"{dropped} messages dropped so far", level="WARN")))
         self._draw(stream, scene, initial, slicer.finish())
+        self._draw_truths(stream, scene)
         stream.close()
+
+    def _draw_truths(self, stream: Stream, scene: ViewerScene) -> None:
+        """The true drones and the errors against them, at their own times."""
+        for number, (stamps_ns, xyz_m) in enumerate(self.truths, 1):
+            last_ns = -TRUTH_PERIOD_NS
+            for stamp_ns, position_m in zip(stamps_ns.tolist(), xyz_m, strict=True):
+                if stamp_ns - last_ns >= TRUTH_PERIOD_NS:
+                    last_ns = stamp_ns
+                    stream.at(stamp_ns)
+                    for entity in draw_pose.truth(number, stamp_ns, position_m):
+                        stream.put(entity)
+        for stamp_ns, entity in draw_pose.errors_against(self.truths, scene) if self.truths else ():
+            stream.at(stamp_ns)
+            stream.put(entity)
 
     def _draw(
         self, stream: Stream, scene: ViewerScene, initial: Iterable[Entity], ready: Iterable[tuple[str, int, Message]]

@@ -13,6 +13,8 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import json
+import os
+import stat
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -207,8 +209,10 @@ def check_ready(settings: SessionSettings) -> None:
         raise LinkError("several hosts need Eclipse Zenoh: pip install -e '.[hosts]'")
     for file in (settings.certificate, settings.key, settings.authority):
         try:
-            with file.open("rb"):
-                pass
+            with file.open("rb") as stream:
+                mode = stat.S_IMODE(os.fstat(stream.fileno()).st_mode)
+            if file == settings.key and mode & 0o077:
+                raise LinkError(f"{file}: other users can read this key. Restrict it: chmod 600 {file}")
         except OSError as error:
             raise LinkError(
                 f"{file}: {error.strerror}; links/zenoh/README.md explains how to create certificates"

@@ -35,6 +35,7 @@ from stages.aim.search_offset import MissedObservation, best_offset_m
 from stages.aim.sweep_trajectory import SweepTrajectory
 from stages.aim.targets import Key, Target, Targets
 from stages.geometry.frames import LidarMount
+from stages.geometry.rig_lidar import RigLidar
 from stages.messages import Candidates, LidarFirings, ServoGoal, ServoState, TrackState
 from stages.sweep.turntable import GearPlay
 
@@ -53,7 +54,7 @@ RPM_RADPS = math.tau / 60.0
 class _State:
     sweep: SweepTrajectory
     play: GearPlay
-    rotor: Rotor = field(default_factory=Rotor)
+    rotor: Rotor
     servo_rad: float | None = None
     elevations_rad: tuple[float, ...] = ()
     targets: Targets = field(default_factory=Targets)
@@ -75,6 +76,7 @@ class BeamAimSettings(Settings):
     """Settings of `BeamAim`."""
 
     mount: LidarMount  # poses of turntable and LiDAR, and the servo's zero, sign and errors
+    unit: RigLidar = RigLidar()  # azimuth offsets of the lasers
     span_m: float = Field(0.5, gt=0, le=10)  # largest dimension of the drone
     travel_deg: tuple[float, float] = (0.0, 180.0)  # servo positions that may be commanded
     limit_rpm: float = Field(55.0, gt=0)  # maximum servo speed; MX-28AR at 12 V
@@ -108,7 +110,8 @@ class BeamAim(Stage[BeamAimSettings]):
 
     def __init__(self, settings: BeamAimSettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
-        self._state = _State(SweepTrajectory(*self._travel_rad), GearPlay(self.settings.mount))
+        rotor = Rotor(self.settings.unit.azimuth_offset_rad, self.settings.unit.azimuth_delay_ns)
+        self._state = _State(SweepTrajectory(*self._travel_rad), GearPlay(self.settings.mount), rotor)
 
     @property
     def _travel_rad(self) -> tuple[float, float]:

@@ -23,8 +23,10 @@ from stages.messages import LidarFirings
 
 @dataclass(slots=True, eq=False)
 class Rotor:
-    """Azimuth and rate of the LiDAR's rotor, predicted with constant rate."""
+    """Azimuth and rate of the LiDAR's rotor, predicted with constant rate; with the lasers' offsets and delays."""
 
+    azimuth_offset_rad: tuple[float, ...]
+    azimuth_delay_ns: tuple[int, ...]
     stamp_ns: int = 0
     azimuth_rad: float = 0.0
     rate_radps: float = 0.0
@@ -39,9 +41,12 @@ class Rotor:
         n = firings.pulse_stamp_ns.size
         if n < 2:
             return
-        stamp_ns, azimuth = int(firings.pulse_stamp_ns[-1]), float(firings.azimuth_rad[-1])
-        dt = (stamp_ns - int(firings.pulse_stamp_ns[0])) * 1e-9
-        rate = ((azimuth - float(firings.azimuth_rad[0])) % math.tau) / dt if dt > 0 else 0.0
+        first, last = int(firings.laser[0]), int(firings.laser[-1])
+        stamp_ns = int(firings.pulse_stamp_ns[-1]) - self.azimuth_delay_ns[last]
+        azimuth = float(firings.azimuth_rad[-1]) - self.azimuth_offset_rad[last]
+        first_azimuth = float(firings.azimuth_rad[0]) - self.azimuth_offset_rad[first]
+        dt = (stamp_ns - (int(firings.pulse_stamp_ns[0]) - self.azimuth_delay_ns[first])) * 1e-9
+        rate = ((azimuth - first_azimuth) % math.tau) / dt if dt > 0 else 0.0
         if rate > 0:
             self.rate_radps = rate if self.rate_radps == 0 else self.rate_radps + 0.05 * (rate - self.rate_radps)
         self.stamp_ns, self.azimuth_rad = stamp_ns, azimuth

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stages.calibration.columns import LASERS, Placed, place
+from stages.calibration.columns import Placed, place
 from stages.calibration.motion import drift, shift
 from stages.calibration.patches import Patches, thickness_m
 from stages.calibration.result import CURVE, Finding, Travel, accepted, assess, curve_sigmas
@@ -101,7 +101,7 @@ def calibrate(
     written = accepted(numbers, solution.mount, findings, solution.covariance, travel)
     curve_rad, mean_rad = curve_sigmas(solution.covariance, travel)
     chosen = solution.system.chosen
-    on_patches = Returns(returns.stamp_ns[chosen], returns.laser[chosen], returns.xyz_lidar_m[chosen])
+    on_patches = Returns(returns.stamp_ns[chosen], returns.laser[chosen], returns.xyz_lidar_m[chosen], returns.lasers)
     before, after = (
         place(on_patches, servo_at(trace, on_patches.stamp_ns, mount, max_gap_s), mount, solution.bias_m)
         for mount in (numbers, written)
@@ -143,7 +143,7 @@ def _check_still(
     returns: Returns, trace: ServoTrace, rig: ServoMount, solution: Solution | None, both_ways: bool, max_gap_s: float
 ) -> None:
     """Raise CannotCalibrate if the vehicle moved, under the mount found or, without one, the rig's."""
-    mount, bias_m = (solution.mount, solution.bias_m) if solution else (rig, np.zeros(LASERS))
+    mount, bias_m = (solution.mount, solution.bias_m) if solution else (rig, np.zeros(returns.lasers))
     placed = place(returns, servo_at(trace, returns.stamp_ns, mount, max_gap_s), mount, bias_m)
     between = None if not both_ways else shift(placed.xyz_m, returns.stamp_ns)
     system = linearise(returns, trace, mount, bias_m, COARSE_RAD[0], max_gap_s)

@@ -14,8 +14,6 @@ from stages.calibration.scan_passes import Returns, ServoAt
 from stages.calibration.servo_mount import ORDERS, ServoMount
 from stages.geometry.frames import Array64
 
-LASERS = 16
-
 
 class Placed(NamedTuple):
     """Returns in the base frame (n, 3); `turned`: cosine and sine (n, 2) of the turntable's angle."""
@@ -38,7 +36,7 @@ class Placed(NamedTuple):
 
 
 def place(returns: Returns, servo: ServoAt, mount: ServoMount, bias_m: Array64) -> Placed:
-    """Place returns by a mount; bias_m (16,) is subtracted from each laser's ranges. NaN where the angle is NaN."""
+    """Place returns by a mount; bias_m (lasers,) is subtracted from each laser's ranges. NaN where the angle is NaN."""
     angle = mount.sign * (servo.position_rad - servo.play_side * mount.play_rad / 2 - mount.zero_rad)
     angle = angle - mount.encoder_error_rad(servo.position_rad)
     turned = np.column_stack([np.cos(angle), np.sin(angle)])
@@ -85,9 +83,9 @@ def mount_columns(placed: Placed, normal: Array64, mount: ServoMount) -> dict[st
     return columns
 
 
-def laser_columns(placed: Placed, normal: Array64, laser: NDArray[np.uint8]) -> Array64:
-    """d(normal . p) / d(bias of each laser), (n, 16)."""
-    columns = np.zeros((len(laser), LASERS))
+def laser_columns(placed: Placed, normal: Array64, laser: NDArray[np.uint8], lasers: int) -> Array64:
+    """d(normal . p) / d(bias of each laser), (n, lasers)."""
+    columns = np.zeros((len(laser), lasers))
     columns[np.arange(len(laser)), laser] = -np.einsum("ij,ij->i", placed.direction, normal)
     return columns
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from stages.calibration.columns import drift_columns
 from stages.calibration.scan_passes import Returns
-from stages.calibration.solve import PRIOR, System, one_step, sandwich, without_planes
+from stages.calibration.solve import System, one_step, prior_information, sandwich, without_planes
 from stages.geometry.frames import Array64
 
 SIGNIFICANT = 5.0  # sigmas
@@ -47,9 +47,10 @@ def drift(system: System, returns: Returns) -> Drift:
     normal = system.patches.normal[system.patches.patch]
     moving = without_planes(drift_columns(system.placed, normal, since_s), system.weight, system.patches)
     wider = replace(system, columns=np.column_stack([system.columns, moving]))
-    k = len(PRIOR)
+    known = prior_information(returns.lasers)
+    k = len(known)
     prior = np.zeros((k + len(EXPECTED), k + len(EXPECTED)))
-    prior[:k, :k], prior[k:, k:] = PRIOR, np.diag(EXPECTED**-2.0)
+    prior[:k, :k], prior[k:, k:] = known, np.diag(EXPECTED**-2.0)
     step = one_step(wider, np.zeros(len(prior)), prior)
     explained = replace(wider, residual=wider.residual + wider.columns @ step)
     sigma = np.sqrt(np.diag(sandwich(explained, stamp_ns, prior))[k:])

@@ -41,6 +41,7 @@ class Returns:
     stamp_ns: NDArray[np.int64]  # (n,)
     laser: NDArray[np.uint8]  # (n,)
     xyz_lidar_m: Array64  # (n, 3)
+    lasers: int = 16  # of the LiDAR
 
 
 @dataclass(frozen=True)

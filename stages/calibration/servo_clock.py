@@ -34,13 +34,14 @@ from stages.calibration.solve import (
     FINE_RAD,
     INFLATION,
     NAMES,
-    PRIOR,
     System,
     linearise,
     one_step,
+    prior_information,
     sandwich,
 )
 from stages.geometry.frames import Array64, LidarMount
+from stages.geometry.rig_lidar import RigLidar
 from stages.messages import LidarFirings, MotionStatus, ServoOffset, ServoState, VehicleMotion
 
 TIME = NAMES.index("time")
@@ -61,6 +62,7 @@ class ServoClockSettings(Settings):
     """Settings of `ServoClock`."""
 
     mount: LidarMount
+    unit: RigLidar = RigLidar()  # model of the LiDAR
     window_s: float = Field(3.0, ge=1, le=20)
     every_packet: int = Field(12, ge=1, le=100)  # every n-th LiDAR message is used
     every_window: int = Field(10, ge=1, le=1000)  # every n-th window is evaluated, once the offset is known to KNOWN_S
@@ -93,7 +95,7 @@ class ServoClock(Stage[ServoClockSettings]):
         angle_rad = math.radians(settings.angle_sigma_deg)
         sigmas = {"axis_x": AXIS_SIGMA_M, "axis_y": AXIS_SIGMA_M, "time": START_SIGMA_S}
         sigmas["play"] = math.radians(settings.play_sigma_deg)
-        self._prior, self._rig = PRIOR.copy(), servo_mount(settings.mount)
+        self._prior, self._rig = prior_information(settings.unit.profile.lasers), servo_mount(settings.mount)
         for i, parameter in enumerate(PARAMETERS):
             self._prior[i, i] = sigmas.get(parameter.name, angle_rad) ** -2.0
 
@@ -166,6 +168,7 @@ class ServoClock(Stage[ServoClockSettings]):
             np.concatenate([f.pulse_stamp_ns[h] for f, h in hit]),
             np.concatenate([f.laser[h] for f, h in hit]),
             np.concatenate([f.xyz_lidar_m[h] for f, h in hit]).astype(np.float64),
+            self.settings.unit.profile.lasers,
         )
         close = self._variance_s2 < KNOWN_S**2
         x, mount = np.zeros(len(self._prior)), self._rig

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.calibration.columns import LASERS, Placed, laser_columns, mount_columns, place
+from stages.calibration.columns import Placed, laser_columns, mount_columns, place
 from stages.calibration.parameters import PARAMETERS
 from stages.calibration.patches import Patches, find_patches
 from stages.calibration.scan_passes import Returns, ServoTrace, servo_at
@@ -39,8 +39,6 @@ FINE_ROUNDS = 6
 SETTLED = 1.5  # largest spread of the last iterations, in sigmas; a larger one is no solution
 NAMES = tuple(parameter.name for parameter in PARAMETERS)
 EXPECTED = np.array([parameter.expected * parameter.per_unit for parameter in PARAMETERS])
-PRIOR = np.diag(np.concatenate([EXPECTED, np.full(LASERS, BIAS_SIGMA_M)]) ** -2.0)  # all unknowns except the planes
-PRIOR[len(NAMES) :, len(NAMES) :] += MEAN_BIAS_SIGMA_M**-2.0 / LASERS**2
 
 
 @dataclass(frozen=True)
@@ -66,9 +64,16 @@ class Solution:
     """The estimated mount and its covariance."""
 
     mount: ServoMount
-    bias_m: Array64  # (16,) of each laser
+    bias_m: Array64  # (lasers,)
     covariance: Array64  # (p, p) of PARAMETERS, SI units
     system: System
+
+
+def prior_information(lasers: int) -> Array64:
+    """Information (k, k) of all unknowns except the planes: NAMES, then the lasers' biases."""
+    prior = np.diag(np.concatenate([EXPECTED, np.full(lasers, BIAS_SIGMA_M)]) ** -2.0)
+    prior[len(NAMES) :, len(NAMES) :] += MEAN_BIAS_SIGMA_M**-2.0 / lasers**2
+    return prior
 
 
 def without_planes(columns: Array64, weight: Array64, patches: Patches) -> Array64:
@@ -99,7 +104,7 @@ def linearise(
     normal = patches.normal[patches.patch]
     by_name = mount_columns(placed, normal, mount)
     columns = np.column_stack(
-        [*(by_name[name] for name in NAMES), laser_columns(placed, normal, returns.laser[chosen])]
+        [*(by_name[name] for name in NAMES), laser_columns(placed, normal, returns.laser[chosen], returns.lasers)]
     )
     scaled = np.abs(patches.residual_m) / patches.sigma_m
     scale = max(1.4826 * float(np.median(scaled)), 0.5)
@@ -115,13 +120,14 @@ def solve(returns: Returns, trace: ServoTrace, rig: ServoMount, max_gap_s: float
     Each iteration searches for patches again, at first with a tolerance for the rig's error. The set of patches varies
     between iterations and changes the parameters by part of a sigma: the result is the mean of the last iterations.
     """
-    mount, x, p = rig, np.zeros(len(PRIOR)), len(NAMES)
+    prior, p = prior_information(returns.lasers), len(NAMES)
+    mount, x = rig, np.zeros(len(prior))
     tried: list[Array64] = []
     for tolerance_rad in [*COARSE_RAD, *[FINE_RAD] * FINE_ROUNDS]:
         system = linearise(returns, trace, mount, x[p:], tolerance_rad, max_gap_s)
         if system is None:
             return None
-        x = x + one_step(system, x)
+        x = x + one_step(system, x, prior)
         mount = rig.moved(dict(zip(NAMES, x[:p].tolist(), strict=True)))
         tried.append(x)
     last = np.array(tried[-FINE_ROUNDS // 2 :])
@@ -130,18 +136,18 @@ def solve(returns: Returns, trace: ServoTrace, rig: ServoMount, max_gap_s: float
     system = linearise(returns, trace, mount, x[p:], FINE_RAD, max_gap_s)
     if system is None:
         return None
-    covariance = sandwich(system, returns.stamp_ns[system.chosen])[:p, :p]
+    covariance = sandwich(system, returns.stamp_ns[system.chosen], prior)[:p, :p]
     settled = last[:, :p].std(axis=0) < SETTLED * np.sqrt(np.diag(covariance))
     return Solution(mount, x[p:], with_floor(covariance), system) if settled.all() else None
 
 
-def one_step(system: System, x: Array64, prior: Array64 = PRIOR) -> Array64:
+def one_step(system: System, x: Array64, prior: Array64) -> Array64:
     """Gauss-Newton step from x (k,), which is relative to the prior."""
     J, r, v = system.columns, system.residual, system.variance_factor
     return np.asarray(np.linalg.solve(J.T @ J / v + prior, -J.T @ r / v - prior @ x), dtype=np.float64)
 
 
-def sandwich(system: System, stamp_ns: NDArray[np.int64], prior: Array64 = PRIOR) -> Array64:
+def sandwich(system: System, stamp_ns: NDArray[np.int64], prior: Array64) -> Array64:
     """Covariance (k, k), with correlated returns within CLUSTER_NS and within a surface."""
     J, v = system.columns, system.variance_factor
     bread = np.linalg.inv(J.T @ J / v + prior)

@@ -1,8 +1,8 @@
 """Chords: runs of one laser's consecutive returns at similar ranges, each the crossing of one object by a beam.
 
-A laser fires every 0.2 deg along its cone. A chord ends where the next pulses return nothing or something farther (the
-end is free), or something nearer (the end is hidden). A drone gives chords that are short and free at both ends; walls,
-ground and trunks give long ones. A chord is reported as soon as it has ended or is longer than any drone.
+A laser fires every 0.1 to 0.4 deg along its cone. A chord ends where the next pulses return nothing or something
+farther (the end is free), or something nearer (the end is hidden). A drone gives chords that are short and free at both
+ends; walls, ground and trunks give long ones. A chord is reported as soon as it has ended or is longer than any drone.
 
 Source: ours; DESIGN, "free-space evidence ... evaluated as data arrives".
 """
@@ -16,10 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.geometry.frames import Array64
+from stages.geometry.lidar_models import LidarProfile
 from stages.kernels.detect.chords import BEFORE, MEMORY, find_chords
 from stages.messages import SweptPulses
 
 COLUMNS = 14
+# A laser fires once in a firing sequence. After a longer pause packets are lost, and it points in another direction.
+GAP_SEQUENCES = 2.7
 
 
 class Chords(NamedTuple):
@@ -33,12 +36,13 @@ class Chords(NamedTuple):
 class ChordFinder:
     """Finds chords in slices, which must be added in order of time."""
 
-    def __init__(self, longest_m: float, jump_m: float, hole_m: float, lasers: int = 16) -> None:
+    def __init__(self, longest_m: float, jump_m: float, hole_m: float, profile: LidarProfile) -> None:
         """`longest_m`: longer chords are no drone. A range step of `jump_m` or a gap of `hole_m` ends a chord."""
         self._longest_m, self._jump_m, self._hole_m = longest_m, jump_m, hole_m
-        self._open = np.zeros((lasers, MEMORY))
+        self._gap_ns = round(GAP_SEQUENCES * profile.sequence_ns)
+        self._open = np.zeros((profile.lasers, MEMORY))
         self._open[:, BEFORE] = math.nan
-        self._times = np.zeros((lasers, 3), dtype=np.int64)
+        self._times = np.zeros((profile.lasers, 3), dtype=np.int64)
 
     def feed(self, pulses: SweptPulses) -> Chords:
         """The chords that ended, or became too long, in this slice."""
@@ -54,6 +58,7 @@ class ChordFinder:
             self._longest_m,
             self._jump_m,
             self._hole_m,
+            self._gap_ns,
             self._open,
             self._times,
             rows,

@@ -37,6 +37,7 @@ from stages.detect.trained.existence import FalseReturns, birth_nats, passed_nat
 from stages.detect.trained.features import features_of
 from stages.detect.trained.model import DetectorModel
 from stages.geometry.frames import Array64
+from stages.geometry.rig_lidar import RigLidar
 from stages.geometry.trajectory import VehicleTrajectory
 from stages.kernels.detect.candidate import SIGMA_M
 from stages.kernels.detect.candidate_table import first_within
@@ -99,6 +100,7 @@ class EvidenceDetectSettings(Settings):
     """Settings of `EvidenceDetect`."""
 
     span_m: float = Field(0.5, gt=0, le=10)  # largest dimension of the drone
+    unit: RigLidar = RigLidar()  # model of the LiDAR
     lowest_deg: float = Field(4.0, ge=-30, le=80)  # least elevation of candidates above the LiDAR's horizon
     nearest_m: float = Field(1.5, ge=0.3)  # least range of candidates
     furthest_m: float = Field(65.0, gt=1)  # greatest range of candidates
@@ -137,7 +139,8 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
             settings.furthest_m,
             settings.clear_m,
         )
-        self._now = _State(ObservationFinder(limits), Travel(math.radians(settings.sweep_deg - 3.0), math.radians(0.5)))
+        finder = ObservationFinder(limits, settings.unit.profile)
+        self._now = _State(finder, Travel(math.radians(settings.sweep_deg - 3.0), math.radians(0.5)))
 
     def on_motion(self, motion: VehicleMotion) -> None:
         """Update the vehicle's trajectory. Without it only vertical motion counts, unless `parked` is set."""

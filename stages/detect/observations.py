@@ -17,12 +17,12 @@ from stages.detect.candidate import Observation
 from stages.detect.chords import ChordFinder
 from stages.detect.isolation import MAX_SLICES, LargeObjectMap, RecentPulses
 from stages.geometry.frames import Array64
+from stages.geometry.lidar_models import LidarProfile
 from stages.kernels.detect.observations import BIG, SMALL, kinds_of, merge_chords, positions_of_kind, round_and_rough
 from stages.kernels.detect.pulse_buffer import WINDOW_NS
 from stages.kernels.sweep.pulses import HOLE, LONGEST, STEP
 from stages.messages import SweptPulses
 
-BEAM_SPACING_RAD = math.radians(2.0)  # between two lasers of a VLP-16
 DELAY_NS = 3_300_000  # after which the surroundings of an observation were scanned
 MEMORY_NS = 3_000_000_000  # of large objects, when the vehicle's motion is known
 SHORT_MEMORY_NS = 1_000_000_000  # and when it is not
@@ -64,10 +64,10 @@ class _Chord(NamedTuple):
 class ObservationFinder:
     """Finds observations in slices, which must be added in order of time."""
 
-    def __init__(self, limits: ObservationLimits) -> None:
-        self._limits = limits
+    def __init__(self, limits: ObservationLimits, profile: LidarProfile) -> None:
+        self._limits, self._beam_spacing_rad = limits, profile.beam_spacing_rad
         span_m = limits.span_m
-        self._chords = ChordFinder(LONGEST * span_m, STEP * span_m, HOLE * span_m)
+        self._chords = ChordFinder(LONGEST * span_m, STEP * span_m, HOLE * span_m, profile)
         self._large = LargeObjectMap()
         self._slices: deque[_Kept] = deque(maxlen=MAX_SLICES)
         self._recent = RecentPulses()
@@ -136,6 +136,6 @@ class ObservationFinder:
     def _isolation(self, middle_m: Array64, range_m: float) -> Array64:
         """Sector counts (TALLY,) of the last slices around a position in the vehicle frame."""
         span_m = self._limits.span_m
-        close_m = max(2.4 * span_m, 1.15 * BEAM_SPACING_RAD * range_m)  # at least two beam spacings wide
-        outer_m = max(self._limits.clear_m, 1.5 * BEAM_SPACING_RAD * range_m)
+        close_m = max(2.4 * span_m, 1.15 * self._beam_spacing_rad * range_m)  # at least two beam spacings wide
+        outer_m = max(self._limits.clear_m, 1.5 * self._beam_spacing_rad * range_m)
         return self._recent.isolation(middle_m, 0.3 * span_m, 1.1 * span_m, close_m, outer_m, 0.5)

@@ -1,6 +1,3 @@
-"""Fusion of LiDAR positions, rotations and odometry into one pose of the drone."""
+"""Fusion of LiDAR positions, IMU and rotations by cameras into one pose of the drone."""
 
-from stages.fuse.fuse import Fuse
-from stages.fuse.inertial.fuse import InertialFuse
-
-__all__ = ["Fuse", "InertialFuse"]
+from stages.fuse.fuse import Fuse as Fuse

@@ -1,12 +1,11 @@
-"""Estimate of the drone's pose and its update by each measurement.
+"""Estimate of the drone by IMU: a bank of yaw hypotheses until the heading is decided, then a factor graph.
 
-    fixes alone          position and velocity (positions.py)
-    a rotation is known  a chain of poses (chain.py), propagated by the drone's odometry, starts; it ends when the
-                         rotation is no longer accepted, the drone is lost, or another track is followed
+Measurements are used in order of time, up to the horizon (measurement_queue.py). The published state is propagated from
+the horizon by the IMU. A measurement that arrives after the horizon has passed its time is moved to the horizon.
 
-Fixes that contradict the estimate consistently reset it, without the rotation, which may be the cause.
+The heading of a lost drone is remembered and propagated by the gyroscope: it is one hypothesis when a drone is found.
 
-Source: DESIGN, Fusion; ours.
+Source: ours; DESIGN, Fusion.
 """
 
 from __future__ import annotations
@@ -15,288 +14,338 @@ import math
 
 import numpy as np
 
-from stages.fuse.branch_check import BranchCheck
-from stages.fuse.chain import PERIOD_NS, Chain
-from stages.fuse.motion_model import WAIT_NS, Motions
-from stages.fuse.positions import GATE, MeasurementCovariance, Positions
-from stages.fuse.settings import FuseErrors, FuseLimits
-from stages.fuse.smoother import BackEnd
-from stages.geometry.frames import Array64, heading_rad, rotation_z
-from stages.geometry.se3 import mahalanobis2, position_covariance
-from stages.heading.motion_yaw import MAX_ALTERNATIVE_ODDS, Point
-from stages.heading.odometry_yaw import OdometryYaw
-from stages.heading.yaw_fit import Yaw, apart_rad
-from stages.messages import DroneAttitude, DroneFix, DroneLocalPosition, DroneOdometry, VehicleMotion, VisualMotion
+from stages.fuse.consistency import InformationInflation, Rejected, inflation
+from stages.fuse.fix_covariance import FixCovariance, fix_covariance
+from stages.fuse.graph import InertialGraph
+from stages.fuse.measurement_queue import Measurement, MeasurementQueue
+from stages.fuse.settings import FuseErrors
+from stages.geometry.frames import Array64
+from stages.geometry.se3 import CHI2_999_3, mahalanobis2
+from stages.geometry.trajectory import VehicleTrajectory
+from stages.heading import bank_measurements as measure
+from stages.heading.autopilot_samples import AutopilotSamples
+from stages.heading.earlier_run import EarlierRun
+from stages.heading.heading_memory import HeadingMemory
+from stages.heading.imu_buffer import ImuBuffer
+from stages.heading.inertial_heading import InertialHeading, bias_free_turn, turn_between
+from stages.heading.inertial_state import POSITION, THETA, InertialState
+from stages.heading.odometry_heading import OdometryHeading, OdomYaw
+from stages.heading.ownership import Ownership, log_evidence
+from stages.messages import DroneFix, DroneMotion, RelativeRotation, VisualMotion
 
-LEAST_MPS = 0.5  # minimum speed for a direction of flight by the camera
-BRANCH_RAD, BRANCHES = math.radians(30.0), 3  # consecutive rotations this far off are another branch
+TILT_TIME_S = 20.0  # time constant of the error of roll and pitch
+KEPT_NS = 15_000_000_000  # without a LiDAR position the estimate ends; the heading is remembered
+FREE_NS = 1_000_000_000  # without IMU and vanishing points the yaw is dropped after this time
+LATEST_NS = 500_000_000  # a measurement that is older than the state by more is not used
+LATE_MPS2 = 1.5  # change of velocity that moving a late position to the state's time ignores
 
 
 class Estimator:
     """State of the drone that is followed."""
 
-    def __init__(self, back: BackEnd, errors: FuseErrors, limits: FuseLimits, parked: bool) -> None:
-        self._tilt_rad2 = math.radians(errors.tilt_deg) ** 2
-        self._yaw_sigma_rad = math.radians(limits.yaw_sigma_deg)
-        self._lost_ns = round(limits.lost_after_s * 1e9)
-        self.motions = Motions(errors, parked)
-        self.positions = Positions(errors, self.motions)
-        self.chain = Chain(back, errors, self.positions)
-        self.odometry_yaw = OdometryYaw(errors, self._yaw_sigma_rad)
-        self._branch_check = BranchCheck(self.motions)
-        self.resets, self.track_id = 0, 0
-        self.unverified = False  # the new track may be of another object than the one before
-        self._was_still = False
+    def __init__(self, errors: FuseErrors, vehicle: VehicleTrajectory, lag_s: float) -> None:
+        self._errors, self._vehicle = errors, vehicle
+        self.imu = ImuBuffer()
+        self.heading = InertialHeading(self.imu)
+        self.graph = InertialGraph(self.imu, lag_s)
+        self.ownership = Ownership()
+        self.suspect = False  # what was followed moved otherwise than the IMU measures, and nothing has shown since
+        self.odometry = OdometryHeading(math.radians(errors.compass_deg), errors.compass_outliers)
+        self._autopilot = AutopilotSamples()
+        self._memory = HeadingMemory(self.imu)
+        self.earlier = EarlierRun(errors.changed_frames)
+        self._queue = MeasurementQueue(self.imu, vehicle)
+        self.resets, self.too_late = 0, 0
+        self.fix_ns: int | None = None  # newest LiDAR position used
         self.newest_fix_ns: int | None = None  # also when the drone is lost
-        self.unconfirmed_ns: int | None = None  # newest rotation by vanishing points that no motion has confirmed
-        self.lose()
+        self.rotation_ns: int | None = None  # newest rotation by vanishing points used
+        self.nis = math.nan
+        self.bias_covariance_m2 = np.zeros((3, 3))
+        self.rotation_bias_rad2 = np.zeros((3, 3))
+        self._restart_filters()
 
-    def lose(self) -> None:
-        """Drop the position; the yaw of frame odom stays."""
-        self.positions.lose()
-        self.chain.lose()
-        self.from_vanishing_points = False  # the chain's yaw comes from vanishing points alone
-        self._off_branch = 0
-        self.vp_rotation_ns: int | None = None  # newest rotation by vanishing points that was used
+    def _restart_filters(self) -> None:
+        self._fix_inflation = InformationInflation(self._errors.fix_time_s)
+        self._rotation_inflation = InformationInflation(self._errors.rotation_time_s)
+        self._rejected, self._rejected_rotations = Rejected(), Rejected()
+        self.ownership.restart(self.suspect)
+        self._vertical_ns = 0
+        self.rotation_ns = None
 
-    # motion
+    # input
 
-    def add_vehicle_motion(self, motion: VehicleMotion) -> None:
-        """Add a vehicle pose. The first one, or the first after a gap, may start another map frame."""
-        at_ns, vehicle = self.positions.free.stamp_ns, self.motions.vehicle
-        before = None if at_ns is None else (*vehicle.at(at_ns), vehicle.velocity_mps(at_ns))
-        if not self.motions.add_vehicle_motion(motion):
-            return
-        self.drop_rotation()
-        self.odometry_yaw.forget()
-        self._branch_check.restart()
-        if at_ns is not None and before is not None:
-            R, t, velocity_mps = before
-            R_after, t_after = vehicle.at_in_current_frame(at_ns)
-            R_new_old = R_after @ R.T
-            new_mps = vehicle.velocity_mps(motion.stamp_ns) - R_new_old @ velocity_mps
-            self.positions.turn(R_new_old, t_after - R_new_old @ t, new_mps)
+    def add_motion(self, motion: DroneMotion) -> None:
+        """Add an IMU interval with the autopilot's vertical and, while independent, its odometry."""
+        if self.imu.add(motion):
+            self._autopilot.add(motion)
 
-    def add_autopilot(self, telemetry: DroneAttitude | DroneLocalPosition | DroneOdometry) -> None:
-        """Add telemetry of the autopilot."""
-        self.odometry_yaw.add(self.motions.motion_model.autopilot, telemetry)
+    def add(self, measurement: Measurement) -> None:
+        """Add a measurement; it is used when the horizon reaches its time."""
+        if isinstance(measurement, VisualMotion):
+            self.imu.add_visual_motion(measurement)
+        self._queue.add(measurement)
 
-    def add_visual_motion(self, motion: VisualMotion) -> None:
-        """Add visual odometry of the drone: its turn, and its direction of flight where nothing better measures it."""
-        self.motions.motion_model.images.add(motion)
-        self._branch_check.add_visual_motion(motion)
-        fix_ns, free = self.positions.fix_ns, self.positions.free
-        fresh = fix_ns is not None and abs(motion.stamp_ns - fix_ns) < WAIT_NS
-        if not (self.chain.running and fresh) or motion.direction_from is None or motion.direction_sigma_rad is None:
-            return
-        if not self.motions.map_is_fixed(motion.stamp_ns):  # the direction is over ground, not relative to the vehicle
-            return
-        if np.linalg.norm(free.velocity_mps) > LEAST_MPS:
-            R, _, P = self.chain.at(motion.from_ns)
-            sigma = math.hypot(motion.direction_sigma_rad, math.sqrt(float(np.trace(P[:3, :3])) / 3))
-            free.add_direction(R @ motion.direction_from, sigma)
+    def pass_time(self, now_ns: int) -> None:
+        """Move the horizon and use the measurements before it."""
+        horizon_ns = self._queue.horizon_ns(now_ns)
+        for measurement in self._queue.until(horizon_ns):
+            if isinstance(measurement, DroneFix):
+                self._use_fix(measurement)
+            elif isinstance(measurement, RelativeRotation):
+                self._use_rotation(measurement)
+            else:
+                self._use_visual_motion(measurement)
+        self._advance(horizon_ns)
+        if self.fix_ns is not None and now_ns - self.fix_ns > KEPT_NS:
+            self.lose()
+
+    # state
 
     @property
-    def raw_yaw(self) -> Yaw | None:
-        """Yaw in `map` of the autopilot's frame as it reports it now; None: not known, or the drone may be another."""
-        yaw, raw = self.odometry_yaw.yaw, self.motions.motion_model.autopilot.R_odom_raw
-        if yaw is None or self.unverified or self.odometry_yaw.heading.contradiction:
+    def measured_rotation_ns(self) -> int | None:
+        """Newest measurement of the rotation: by vanishing points, or by a LiDAR position together with the IMU."""
+        by_imu = self.fix_ns if self.decided and self.imu.is_current(self.stamp_ns) else None
+        return max((ns for ns in (self.rotation_ns, by_imu) if ns is not None), default=None)
+
+    @property
+    def known(self) -> bool:
+        """Whether a position is known."""
+        return self.graph.running or self.heading.bank is not None
+
+    @property
+    def decided(self) -> bool:
+        """Whether the heading is known."""
+        return self.graph.running or self.heading.decided
+
+    @property
+    def is_own(self) -> bool:
+        """Whether the followed object moves as the IMU measures, and so is the drone; without an IMU: not suspect."""
+        if self.suspect:
+            return self.ownership.cleared
+        return self.ownership.certain or not self.imu.is_current(self.stamp_ns)
+
+    @property
+    def odom_yaw(self) -> OdomYaw | None:
+        """Yaw of the autopilot's frame in `map`; None: not known, or the object may be another one than the drone."""
+        if self.suspect or not (self.odometry.confirmed or self.ownership.certain):
             return None
-        return Yaw(yaw.stamp_ns, yaw.yaw_rad + heading_rad(raw), yaw.variance_rad2)
+        return self.odometry.odom_yaw
 
-    # prediction
+    @property
+    def stamp_ns(self) -> int:
+        """Time of the state at the horizon."""
+        return self.graph.stamp_ns if self.graph.running else self.heading.stamp_ns
 
-    def at(self, stamp_ns: int) -> tuple[Array64 | None, Array64, Array64]:
-        """R_map_drone, position and covariance (6, 6) of a drone whose position is known.
+    def at(self, stamp_ns: int) -> InertialState:
+        """One row: the state propagated to a time; its rotation is valid when `decided`."""
+        if self.graph.running:
+            return self.graph.at(stamp_ns)
+        assert self.heading.bank is not None
+        one = self.heading.decision() if self.decided else self.heading.bank.mean()
+        return self.imu.propagate(one, np.ones(1), self.heading.stamp_ns, stamp_ns)
 
-        Without a chain R is None and only the position block of the covariance is valid, map axes.
-        """
-        if not self.chain.running:
-            return None, *self.positions.at(stamp_ns)
-        return self.chain.at(stamp_ns)
+    def lose(self) -> None:
+        """Drop the position; the heading is remembered."""
+        if self.decided:
+            state = self.graph.state if self.graph.running else self.heading.decision()
+            self._memory.remember(self.stamp_ns, state)
+        self._drop()
 
-    def advance(self, now_ns: int) -> None:
-        """Extend the chain to `now_ns`, as far as odometry has arrived; start one when the yaw is known."""
-        self.odometry_yaw.heading.pass_time(now_ns)
-        still = self.motions.map_is_fixed(now_ns)
-        if self._was_still and not still:  # from now on the map frame moves with the vehicle
-            self.drop_rotation()
-            self.odometry_yaw.forget()
-            self.positions.forget_velocity()
-        self._was_still = still
-        if self.odometry_yaw.heading.contradiction:
-            self.drop_rotation()
-            self.odometry_yaw.yaw = None
-        back = self.chain.back
-        if self.chain.running and now_ns - back.stamp_ns > self._lost_ns:
-            self.lose()  # a gap without any data is not propagated
-        while self.chain.running and back.stamp_ns + PERIOD_NS <= now_ns:
-            next_ns = back.stamp_ns + PERIOD_NS
-            newest = self.motions.newest_ns(next_ns, now_ns)
-            if newest is not None and newest < next_ns and now_ns - next_ns < WAIT_NS:
-                break
-            R_odom = self.motions.motion_model.R_odom_drone(next_ns)
-            self.chain.extend(next_ns, R_odom)
-            if R_odom is not None and self.motions.map_is_fixed(next_ns):
-                self.odometry_yaw.remember(next_ns, back.R_map_drone @ R_odom.T, self.chain.yaw_sigma_rad**2)
-        if not self.chain.running and self.positions.free.stamp_ns is not None:
-            self._resume(self.positions.free.stamp_ns)
-        elif self.chain.running and self.chain.yaw_sigma_rad > self._yaw_sigma_rad:
-            self._resume(back.stamp_ns)
+    def forget(self) -> None:
+        """Drop the position and the remembered heading: a contradiction."""
+        self._drop()
+        self._memory.forget()
+        self.odometry.restart()
 
-    # fixes
+    def start_map(self) -> None:
+        """Another map frame begins: drop everything, also what waits for its time."""
+        self.forget()
+        self._queue.clear()
+        self.imu.clear()
 
-    def follow(self, fix: DroneFix) -> None:
-        """Follow the track of a fix; a change of track drops the position.
+    def _drop(self) -> None:
+        self.resets += self.known
+        self.graph.stop()
+        self.heading.stop()
+        self.fix_ns, self.nis = None, math.nan
+        self._restart_filters()
 
-        A track away from the propagated pose may be another object: a remembered yaw makes it a pose only when it has
-        moved, or hovered, as the drone's odometry reports (`unverified`).
-        """
-        if fix.track_id != self.track_id:
-            self._branch_check.restart()
-            self.odometry_yaw.by_motion.restart()
-            self.unverified = self.track_id != 0 and not self._expects(fix)
-            if self.positions.known:
-                self.lose()
-                self.resets += 1
-        self.track_id = fix.track_id
+    # measurements
 
-    def _expects(self, fix: DroneFix) -> bool:
-        """Whether the fix is within the gate of the propagated pose."""
-        if not self.chain.running:
-            return False
-        R_map_vehicle, t = self.motions.vehicle.at(fix.stamp_ns)
-        R, expected_m, covariance = self.chain.at(fix.stamp_ns)
-        fix_m2 = R_map_vehicle @ fix.covariance_m2 @ R_map_vehicle.T
-        off_m = R_map_vehicle @ fix.xyz_vehicle_m + t - expected_m
-        return mahalanobis2(off_m, position_covariance(covariance, R) + fix_m2) <= GATE
+    def _advance(self, stamp_ns: int) -> None:
+        if self.graph.running and not self.imu.is_current(stamp_ns):
+            self._to_bank()
+        if self.graph.running:
+            self.graph.advance(stamp_ns)
+            return
+        self.heading.advance(stamp_ns)
+        last_ns = max(self.rotation_ns or 0, self.imu.newest_ns or 0)  # newest measurement of a rotation or a turn
+        if last_ns and not self.imu.is_current(stamp_ns) and stamp_ns - last_ns > FREE_NS:
+            self.heading.restart_yaw()
+            self.rotation_ns = None
 
-    def add_fix(self, fix: DroneFix) -> None:
-        """Add a LiDAR position at its own time."""
+    def _to_bank(self) -> None:
+        """The IMU has ended: go on with the bank, from the graph's state."""
+        self.heading.resume(self.graph.stamp_ns, self.graph.state)
+        self.graph.stop()
+
+    def _use_fix(self, fix: DroneFix) -> None:
         stamp_ns = fix.stamp_ns
-        if not self.motions.vehicle.in_current_frame(stamp_ns):
+        if not self._vehicle.in_current_frame(stamp_ns):
             return
+        R_map_vehicle, t = self._vehicle.at(stamp_ns)
+        z, covariance = R_map_vehicle @ fix.xyz_vehicle_m + t, fix_covariance(fix, self._vehicle, self._errors)
         self.newest_fix_ns = max(stamp_ns, self.newest_fix_ns or stamp_ns)
-        R_map_vehicle, t = self.motions.vehicle.at(stamp_ns)
-        z = R_map_vehicle @ fix.xyz_vehicle_m + t
-        ahead_m2, _, _ = self.motions.vehicle_covariance_m2(stamp_ns, fix.xyz_vehicle_m)
-        bias_covariance_m2 = fix.bias_covariance_m2
-        noise = MeasurementCovariance(
-            R_map_vehicle @ (fix.covariance_m2 + ahead_m2) @ R_map_vehicle.T,
-            None if bias_covariance_m2 is None else R_map_vehicle @ bias_covariance_m2 @ R_map_vehicle.T,
-        )
-        if not self.positions.known:
-            self.positions.find(fix, z, noise)
+        if self.odometry.odom_yaw is None:
+            self.odometry.start(self.earlier.odom_yaw(stamp_ns, z, covariance.whole))
+        earlier = self.earlier.heading(stamp_ns, z, covariance.whole, self.known and self.decided)
+        if not self.known or earlier is not None:
+            self._find(fix, z, covariance, earlier)
             return
-        R, expected_m, covariance = self.at(stamp_ns)
-        expected_m2 = covariance[3:, 3:] if R is None else position_covariance(covariance, R)
-        taken = self.positions.accepts(stamp_ns, z - expected_m, expected_m2, noise)
-        if taken is None:
+        late_ns = max(self.stamp_ns - stamp_ns, 0)
+        if late_ns > LATEST_NS:
+            self.too_late += 1
             return
-        if not taken:
-            self._reinitialise(fix, z, noise)
+        late_s = late_ns * 1e-9
+        state = self._at_horizon(stamp_ns)
+        v = state.velocity_mps[0]
+        noise = covariance.white * self._fix_inflation.factor(stamp_ns) + (self._errors.clock_s**2) * np.outer(v, v)
+        measured, z = z, z + late_s * v
+        noise = noise + (0.5 * LATE_MPS2 * late_s**2) ** 2 * np.eye(3)
+        off = z - state.xyz_m[0]
+        nis = mahalanobis2(off, state.covariance[0, POSITION, POSITION] + noise)
+        if nis > CHI2_999_3 and self._rejected.add(stamp_ns, off, noise):
+            self.forget()
+            self._find(fix, z, covariance)
             return
-        factor = self.positions.worth(stamp_ns)
-        if R is not None:
-            self.chain.add_position(stamp_ns, R, z, factor * self.positions.fix_covariance_m2)
-        R_after = None if R is None else self.chain.at(stamp_ns)[0]  # what the fix corrects in rotation is not drift
-        self.positions.follow(stamp_ns, z, factor, R_after)
-        self._branch_check.add_fix(fix)
-        self._add_motion_point(stamp_ns, z, noise.whole_m2)
-
-    def _reinitialise(self, fix: DroneFix, z: Array64, noise: MeasurementCovariance) -> None:
-        """Restart at fixes that agree with each other and contradict the estimate."""
-        if self.chain.running and self.from_vanishing_points:
-            self.odometry_yaw.heading.contradict("the LiDAR positions contradict the heading by vanishing points")
-        self.lose()
-        self.positions.find(fix, z, noise)
-        self.odometry_yaw.yaw = None
-        self.odometry_yaw.by_motion.restart()
-        self._branch_check.restart()
-        self.resets += 1
-
-    def _add_motion_point(self, stamp_ns: int, z: Array64, fix_m2: Array64) -> None:
-        """Add an accepted fix with the autopilot's position: together they measure the heading."""
-        odometry = self.motions.motion_model.autopilot.position(stamp_ns)
-        if odometry is None or not self.motions.map_is_fixed(stamp_ns):
-            return
-        if not self.odometry_yaw.add_point(Point(stamp_ns, z, 0.5 * float(fix_m2[0, 0] + fix_m2[1, 1]), *odometry)):
-            self.drop_rotation()
-        elif self.odometry_yaw.motion_agrees(stamp_ns):
-            self.from_vanishing_points = False
-
-    # rotations
-
-    def add_rotation(self, stamp_ns: int, R_vehicle_drone: Array64, covariance_rad2: Array64, switches: int) -> None:
-        """Add a RESOLVED rotation at its own time."""
-        if not self.motions.vehicle.in_current_frame(stamp_ns):
-            return
-        R, heading = self.motions.vehicle.at(stamp_ns)[0] @ R_vehicle_drone, self.odometry_yaw.heading
-        R_odom = self.motions.R_odom_drone(stamp_ns)
-        sigma = math.sqrt(float(np.linalg.eigvalsh(covariance_rad2)[-1]))
-        yaw_rad = None if R_odom is None else heading_rad(R @ R_odom.T)
-        if heading.switched(switches):
-            self.unresolved()
-        self._branch_check.add_vp_rotation(stamp_ns, R)
-        own = self.odometry_yaw.useful(stamp_ns)
-        if own is not None and yaw_rad is not None and apart_rad(own.yaw_rad, yaw_rad) > BRANCH_RAD:
-            self._off_branch += 1
-            if self._off_branch >= BRANCHES:
-                heading.contradict("the vanishing points give another heading than the one known so far", stamp_ns)
-            return
-        self._off_branch = 0
-        fits = not self.chain.running or self.chain.fits(stamp_ns, R, covariance_rad2)
-        if fits is None:
-            return
-        if not heading.add_vp_rotation(stamp_ns, switches, yaw_rad, sigma) or not self.positions.known:
-            return
-        if not self.chain.running or not fits:
-            self._start_with_vp_rotation(stamp_ns, R, covariance_rad2, yaw_rad, sigma)
+        if nis <= CHI2_999_3:
+            self._rejected.clear()
+            self._add_odometry(stamp_ns, measured, float(noise[0, 0] + noise[1, 1]) / 2)
+        if self.graph.running:
+            used = self._add_to_graph(max(stamp_ns, self.stamp_ns), z, noise, nis, state)
         else:
-            self.chain.add_rotation(stamp_ns, R, covariance_rad2)
-            self.vp_rotation_ns = stamp_ns
+            used = nis <= CHI2_999_3
+            self._add_to_bank(stamp_ns, z, noise)
+        if used and self.known:
+            self.nis, self.fix_ns = nis, max(stamp_ns, self.fix_ns or stamp_ns)
+            self.bias_covariance_m2 = covariance.bias
 
-    def _start_with_vp_rotation(
-        self, stamp_ns: int, R: Array64, covariance_rad2: Array64, yaw_rad: float | None, sigma_rad: float
+    def _at_horizon(self, stamp_ns: int) -> InertialState:
+        """State at a measurement that is not before the horizon, else at the horizon."""
+        if self.graph.running:
+            return self.graph.at(max(stamp_ns, self.graph.stamp_ns))
+        self.heading.advance(stamp_ns)
+        assert self.heading.bank is not None
+        return self.heading.bank.mean()
+
+    def _add_to_graph(self, stamp_ns: int, z: Array64, noise: Array64, nis: float, predicted: InertialState) -> bool:
+        """Add a LiDAR position to the graph, unless it is rejected. Whether it is in the estimate."""
+        used = nis <= CHI2_999_3 and self.graph.add_position(stamp_ns, z, noise, predicted)
+        if not used:
+            self.graph.advance(stamp_ns)
+        self._add_vertical(self.graph.stamp_ns)
+        off = z - predicted.xyz_m[0]
+        self._add_ownership(stamp_ns, z, noise, log_evidence(off, predicted.covariance[0, POSITION, POSITION] + noise))
+        return used
+
+    def _add_to_bank(self, stamp_ns: int, z: Array64, noise: Array64) -> None:
+        """Add a LiDAR position to the bank; the graph starts when the heading is decided."""
+        self.heading.advance(stamp_ns)
+        self._add_vertical(self.heading.stamp_ns)
+        self._add_ownership(stamp_ns, z, noise, self.heading.add_position(z, noise))
+        self.heading.decide(self.is_own)
+        if self.decided and self.imu.is_current(stamp_ns):
+            self.graph.start(self.heading.stamp_ns, self.heading.decision())
+            if self.graph.running:
+                self.heading.stop()
+
+    def _add_ownership(self, stamp_ns: int, z: Array64, noise: Array64, evidence: float | None) -> None:
+        """Whether the object is the drone; the estimate of another one ends, and nothing is published until it is."""
+        self.ownership.add(stamp_ns, z, noise, evidence if self.imu.is_current(stamp_ns) else None)
+        if self.ownership.cleared:
+            self.suspect = False
+        if self.ownership.denied if self.graph.running else self.ownership.excluded:
+            self.suspect = True
+            self.forget()
+
+    def _find(
+        self, fix: DroneFix, z: Array64, covariance: FixCovariance, earlier: tuple[float, float, float] | None = None
     ) -> None:
-        """Start a chain by a rotation from vanishing points, once the motion measured by this stage confirms it.
+        """Start at a LiDAR position; `earlier`: yaw of an earlier run, its sigma and the probability that it holds."""
+        velocity = fix.velocity_vehicle_mps
+        if velocity is not None:
+            velocity = self._vehicle.to_map(fix.stamp_ns, fix.xyz_vehicle_m, velocity)[1]
+        up = self._autopilot.up_drone(fix.stamp_ns)
+        self._restart_filters()
+        self.odometry.on_found()
+        memory = earlier or self._memory.yaw(fix.stamp_ns, z, covariance.whole)
+        level = np.array([0.0, 0.0, 1.0]) if up is None else up
+        self.heading.start(fix.stamp_ns, z, covariance.whole, velocity, level, memory)
+        self.fix_ns, self.bias_covariance_m2 = fix.stamp_ns, covariance.bias
 
-        `align` determines the branch by motion too. But once a pose is published the autopilot may fuse it, and from
-        then on its odometry agrees with it, right or wrong: so the first published pose has to be on the right branch.
-        """
-        if self.chain.running and apart_rad(heading_rad(R @ self.chain.at(stamp_ns)[0].T), 0.0) < BRANCH_RAD:
-            self.chain.start(stamp_ns, R, covariance_rad2)  # consistent rejections: the estimate has drifted
-            self.resets += 1
+    def _add_vertical(self, stamp_ns: int) -> None:
+        """The autopilot's roll and pitch, each tilt_period_s."""
+        e = self._errors
+        up = self._autopilot.up_drone(stamp_ns)
+        if up is None or (stamp_ns - self._vertical_ns) * 1e-9 < e.tilt_period_s:
             return
-        confirmed = yaw_rad is not None and self.odometry_yaw.confirms(stamp_ns, yaw_rad, sigma_rad)
-        if not (confirmed or self._branch_check.agrees(MAX_ALTERNATIVE_ODDS)):
-            self.drop_rotation()
-            self.unconfirmed_ns = stamp_ns
+        self._vertical_ns = stamp_ns
+        sigma = math.radians(e.tilt_deg) * math.sqrt(inflation(e.tilt_period_s, TILT_TIME_S))
+        if self.graph.running:
+            self.graph.add_vertical(up, sigma)
+        else:
+            self.heading.add_vertical(up, sigma)
+
+    def _add_odometry(self, stamp_ns: int, z: Array64, variance_m2: float) -> None:
+        """The autopilot's own position at a LiDAR position: evidence for the heading while it is undecided."""
+        own = self._autopilot.odometry(stamp_ns)
+        self.heading.evidence = None
+        if own is not None:
+            self.odometry.add(stamp_ns, z, variance_m2, own.xyz_odom_m, own.segment)
+            if not self.graph.running:
+                self.heading.evidence = self.odometry.evidence(stamp_ns, own.R_odom_drone)
+
+    def _use_rotation(self, rotation: RelativeRotation) -> None:
+        if rotation.R_vehicle_drone is None or rotation.covariance_rad2 is None or not self.known:
             return
-        self.resets += self.chain.running
-        self.chain.start(stamp_ns, R, covariance_rad2)
-        self.from_vanishing_points = True
+        if not self._vehicle.in_current_frame(rotation.stamp_ns):
+            return
+        stamp_ns, e = rotation.stamp_ns, self._errors
+        R_map_vehicle = self._vehicle.at(stamp_ns)[0]
+        R = R_map_vehicle @ rotation.R_vehicle_drone
+        white = (1.0 - e.rotation_bias_share) * rotation.covariance_rad2
+        factor = self._rotation_inflation.factor(stamp_ns)
+        if not self.graph.running:
+            self.heading.advance(stamp_ns)
+            if (self.heading.add_rotation(stamp_ns, R, R_map_vehicle, factor * white) or 0.0) > 0.5:
+                self._rotation_used(rotation)
+            return
+        if abs(stamp_ns - self.graph.stamp_ns) > LATEST_NS:
+            self.too_late += 1
+            return
+        graph = self.graph
+        dR, variance = turn_between(self.imu, stamp_ns, graph.stamp_ns, graph.state.bias[0])
+        covariance = dR.T @ (factor * white) @ dR + variance * np.eye(3)
+        off, nearest = (part[0] for part in measure.nearest_quarter(graph.state.R, R @ dR, R_map_vehicle))
+        if mahalanobis2(off, graph.state.covariance[0, THETA, THETA] + covariance) > CHI2_999_3:
+            if self._rejected_rotations.add(stamp_ns, off, covariance):
+                self.forget()
+            return
+        self._rejected_rotations.clear()
+        if graph.add_rotation(nearest, covariance):
+            self._rotation_used(rotation)
 
-    def unresolved(self) -> None:
-        """The branch by vanishing points is unknown or another one: drop what came from them alone."""
-        self._branch_check.restart()
-        if self.chain.running and self.from_vanishing_points:
-            self.drop_rotation()
-            self.odometry_yaw.yaw = None
+    def _rotation_used(self, rotation: RelativeRotation) -> None:
+        assert rotation.covariance_rad2 is not None
+        self.rotation_ns = rotation.stamp_ns
+        self.rotation_bias_rad2 = self._errors.rotation_bias_share * rotation.covariance_rad2
 
-    def drop_rotation(self) -> None:
-        """Drop the rotation; the position stays."""
-        self.resets += self.chain.running
-        self.chain.running, self.from_vanishing_points = False, False
-
-    def _resume(self, stamp_ns: int) -> None:
-        """Start a chain with the known yaw of frame odom, if there is one."""
-        own, R_odom = self.odometry_yaw.known(stamp_ns), self.motions.R_odom_drone(stamp_ns)
-        if own is not None and self.unverified:
-            self.unverified = not self.odometry_yaw.by_motion.fits(own)
-            if self.unverified:
-                return
-        if own is not None and R_odom is not None:
-            R = rotation_z(own.yaw_rad) @ R_odom
-            variance = np.diag([self._tilt_rad2, self._tilt_rad2, own.sigma_at(stamp_ns) ** 2])
-            self.chain.start(stamp_ns, R, R.T @ variance @ R)
+    def _use_visual_motion(self, motion: VisualMotion) -> None:
+        if not self.graph.running:
+            self.heading.advance(motion.stamp_ns)
+            self.heading.add_visual_motion(motion)
+            return
+        turn = bias_free_turn(self.imu, motion)
+        if turn is not None:
+            rate, by_images, covariance = turn
+            self.graph.add_gyro_bias(rate - by_images, math.sqrt(float(np.trace(covariance)) / 3))

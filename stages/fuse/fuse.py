@@ -1,14 +1,15 @@
-"""Fuse: one pose of the drone, 50 times a second, from all measurements.
+"""Fuse: one pose of the drone, 50 times a second, from LiDAR positions, IMU and rotations by cameras.
 
-    fixes, rotations, odometries, each at its own time (estimator.py)
-      -> a chain of poses (smoother.py)  -> predicted to now -> RelativePose
+    fixes, rotations, IMU intervals, each at its own time (estimator.py)
+      -> bank of headings, then a graph of poses  -> propagated to now -> RelativePose, HeadingEstimate
 
 Now is the newest stamp received on any port, on a grid of 20 ms; it never decreases. Every port but `fix` may be
-unwired, stop and resume. Without `motion` the vehicle frame serves as the map frame. The drone's odometry over ground
-is then used only with the setting `parked`, which states that the vehicle is stationary.
+unwired, stop and resume. Without `motion` the vehicle frame serves as the map frame; the IMU is then used only with the
+setting `parked`, which states that the vehicle is stationary. Without an IMU there are positions, and a rotation only
+while cameras give one whose branch is decided.
 
-A rotation comes from a RESOLVED RelativeRotation, or from the drone's motion by LiDAR and autopilot (motion_yaw.py):
-then FULL needs no images. A contradiction of the two (fused_heading.py) ends FULL at once. States: status.py.
+The autopilot's own position and attitude are evidence for the heading only while they are independent of our pose
+(DroneMotion.autopilot); its yaw may be wrong by any angle.
 
 Source: ours; DESIGN, Fusion and The graph: fuse.
 """
@@ -16,30 +17,30 @@ Source: ours; DESIGN, Fusion and The graph: fuse.
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Iterator
 from typing import Any, ClassVar
 
+import numpy as np
 from pydantic import Field
 
 from flow.counters import Counters
 from flow.message import Message
 from flow.stage import Settings, Stage
-from stages.fuse.chain import yaw_sigma_rad
 from stages.fuse.estimator import Estimator
 from stages.fuse.intake import Intake
+from stages.fuse.jumps import Jumps
+from stages.fuse.map_frame import MapFrame
 from stages.fuse.pose_message import MapEstimate, Status, lost, pose
 from stages.fuse.settings import FuseErrors, FuseLimits
-from stages.fuse.smoother import BackEnd, Smoother
-from stages.fuse.status import Jumps, state_of, unconfirmed_reason
+from stages.fuse.status import state_of, undecided_reason
 from stages.fuse.track_continuity import TrackContinuity
-from stages.geometry.se3 import position_covariance
+from stages.geometry.frames import Array64, heading_rad
+from stages.heading.inertial_state import POSITION, VELOCITY, InertialState, yaw_sigma_rad
 from stages.messages import (
-    BranchState,
-    DroneAttitude,
     DroneFix,
-    DroneLocalPosition,
-    DroneOdometry,
+    DroneMotion,
+    HeadingEstimate,
+    HeadingPrior,
     PoseState,
     RelativePose,
     RelativeRotation,
@@ -51,8 +52,9 @@ from stages.messages import (
 )
 
 GRID_NS = 20_000_000
-AMBIGUOUS_NS = 1_000_000_000  # an ambiguous rotation is reported for this long
-Poses = Iterator[RelativePose]
+HEADING_NS = 200_000_000  # between two HeadingEstimates
+LEAST_PUBLISHED = 1e-4  # probability of a hypothesis
+Poses = Iterator[RelativePose | HeadingEstimate]
 
 
 class FuseSettings(Settings):
@@ -60,76 +62,65 @@ class FuseSettings(Settings):
 
     parked: bool = False  # the vehicle is stationary, even without VehicleMotion
     track_id: int | None = Field(None, ge=1)  # follow this drone; None: the lowest number that is TRACKING
-    lag_s: float = Field(3.0, ge=0.5, le=20)
+    lag_s: float = Field(2.0, ge=0.5, le=10)
     errors: FuseErrors = FuseErrors()
     limits: FuseLimits = FuseLimits()
 
 
 class Fuse(Stage[FuseSettings]):
-    """Pose of the drone by a fixed-lag smoother, with its state."""
+    """Pose of the drone by IMU and LiDAR, with its state."""
 
     optional_inputs: ClassVar[frozenset[str]] = frozenset(
-        {"rotation", "motion", "position", "odometry", "attitude", "visual_motion", "track", "servo", "tick"}
+        {"rotation", "motion", "drone_motion", "visual_motion", "prior", "track", "servo", "tick"}
     )
 
     def __init__(self, settings: FuseSettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
-        self._published_ns: int = 0
-        self._waiting: list[DroneFix | RelativeRotation] = []
-        self._ambiguous_ns: int | None = None
-        self._rotation_reason: str = "no rotation received"
         settings = self.settings
-        self._estimator = Estimator(self._back_end(), settings.errors, settings.limits, settings.parked)
+        self._published_ns: int = 0
+        self._map_frame = MapFrame(settings.parked)
+        self._estimator = Estimator(settings.errors, self._map_frame.vehicle, settings.lag_s)
         self._track_continuity = TrackContinuity(settings.track_id)
         self._intake, self._jumps = Intake(round(settings.lag_s * 1e9)), Jumps(settings.limits)
-
-    def _back_end(self) -> BackEnd:
-        return Smoother(self.settings.lag_s)
-
-    @property
-    def rejected(self) -> Counter[str]:
-        """Invalid messages, by reason."""
-        return self._intake.rejected
+        self._track_id = 0
+        self._map_was_fixed = False
 
     @property
     def counters(self) -> Counters:
-        """Invalid messages by reason, and resets of the back end."""
-        return Counters({"back end reset": self.recoveries} if self.recoveries else {}, self.rejected)
-
-    @property
-    def recoveries(self) -> int:
-        """How often the back end had to be reset after an error of its library."""
-        return self._estimator.chain.back.recoveries
+        """Invalid messages by reason, and resets of the smoother."""
+        late = {"too late": self._estimator.too_late} if self._estimator.too_late else {}
+        recoveries = self._estimator.graph.recoveries
+        return Counters({"back end reset": recoveries} if recoveries else {}, {**self._intake.rejected, **late})
 
     def on_motion(self, motion: VehicleMotion) -> Poses:
         """Pose of the vehicle in `map`."""
-        if self._intake.is_valid(motion, "vehicle motion", motion.xyz_map_m, motion.R_map_vehicle):
-            self._estimator.add_vehicle_motion(motion)
+        valid = self._intake.is_valid(motion, "vehicle motion", motion.xyz_map_m, motion.R_map_vehicle)
+        if valid and self._map_frame.add(motion):
+            self._estimator.start_map()
         yield from self._publish(motion)
 
-    def on_odometry(self, odometry: DroneOdometry) -> Poses:
-        """Pose and velocity by the autopilot."""
-        numbers = (odometry.xyz_odom_m, odometry.R_odom_drone, odometry.velocity_drone_mps)
-        if self._intake.is_valid(odometry, "odometry", *numbers, odometry.angular_velocity_drone_radps):
-            self._estimator.add_autopilot(odometry)
-        yield from self._publish(odometry)
+    def on_drone_motion(self, motion: DroneMotion) -> Poses:
+        """Interval of the drone's IMU."""
+        up = () if motion.up_drone is None else (motion.up_drone,)
+        noise = np.array([motion.specific_force_noise, motion.angular_velocity_noise])
+        numbers = (motion.specific_force_drone_mps2, motion.angular_velocity_drone_radps, noise, *up)
+        own = motion.autopilot
+        more = () if own is None else (own.xyz_odom_m, own.R_odom_drone, own.velocity_odom_mps)
+        if self._intake.is_valid(motion, "drone motion", *numbers, *more) and self._map_frame.is_fixed(motion.stamp_ns):
+            self._estimator.add_motion(motion)
+        yield from self._publish(motion)
 
-    def on_attitude(self, attitude: DroneAttitude) -> Poses:
-        """Attitude by the autopilot, used without its odometry."""
-        if self._intake.is_valid(attitude, "attitude", attitude.R_odom_drone, attitude.angular_velocity_drone_radps):
-            self._estimator.add_autopilot(attitude)
-        yield from self._publish(attitude)
-
-    def on_position(self, position: DroneLocalPosition) -> Poses:
-        """Position by the autopilot, in frame odom."""
-        if self._intake.is_valid(position, "position", position.xyz_odom_m, position.velocity_odom_mps):
-            self._estimator.add_autopilot(position)
-        yield from self._publish(position)
+    def on_prior(self, prior: HeadingPrior) -> Poses:
+        """Heading that an earlier run of grd knew."""
+        numbers = np.array([prior.yaw_map_rad, prior.yaw_map_odom_rad, prior.sigma_rad, prior.position_sigma_m])
+        if self._intake.is_valid(prior, "heading prior", prior.xyz_map_m, numbers):
+            self._estimator.earlier.prior = prior
+        yield from self._publish(prior)
 
     def on_visual_motion(self, motion: VisualMotion) -> Poses:
         """Visual odometry of the drone: turns, and directions without scale."""
-        if self._intake.is_valid_visual_motion(motion):
-            self._estimator.add_visual_motion(motion)
+        if self._intake.is_valid_visual_motion(motion) and self._map_frame.is_fixed(motion.stamp_ns):
+            self._estimator.add(motion)
         yield from self._publish(motion)
 
     def on_track(self, state: TrackState) -> Poses:
@@ -140,19 +131,21 @@ class Fuse(Stage[FuseSettings]):
     def on_fix(self, fix: DroneFix) -> Poses:
         """LiDAR position."""
         if self._intake.is_valid_fix(fix):
-            self._waiting.append(fix)
+            self._add_fix(fix)
         yield from self._publish(fix)
 
+    def _add_fix(self, fix: DroneFix) -> None:
+        if not self._track_continuity.accepts(fix.track_id, fix.stamp_ns):
+            return
+        if fix.track_id != self._track_id and self._estimator.known:
+            self._estimator.lose()
+        self._track_id = fix.track_id
+        self._estimator.add(fix)
+
     def on_rotation(self, rotation: RelativeRotation) -> Poses:
-        """Rotation by both cameras; only a RESOLVED one corrects the pose."""
-        self._rotation_reason = rotation.reason
-        if rotation.R_vehicle_drone is None or rotation.covariance_rad2 is None:
-            pass
-        elif rotation.state is not BranchState.RESOLVED:
-            self._ambiguous_ns = rotation.stamp_ns
-            self._estimator.unresolved()
-        elif self._intake.is_valid_rotation(rotation):
-            self._waiting.append(rotation)
+        """Rotation by both cameras, up to a multiple of 90 deg: the heading decides which."""
+        if self._intake.is_valid_rotation(rotation):
+            self._estimator.add(rotation)
         yield from self._publish(rotation)
 
     def on_servo(self, servo: ServoState) -> Poses:
@@ -170,75 +163,80 @@ class Fuse(Stage[FuseSettings]):
         now_ns = self._intake.pass_time(message.stamp_ns)
         if now_ns is None:
             return
-        self._use_waiting(now_ns)
-        self._estimator.advance(now_ns)
         at_ns = now_ns // GRID_NS * GRID_NS
-        if at_ns > self._published_ns:
-            self._published_ns = at_ns
-            yield self._pose(at_ns)
-
-    def _use_waiting(self, now_ns: int) -> None:
-        """Use fixes and rotations up to the newest odometry of the drone, in time order."""
-        if not self._waiting:
+        if at_ns <= self._published_ns:
             return
-        later: list[DroneFix | RelativeRotation] = []
-        for message in sorted(self._waiting, key=lambda m: m.stamp_ns):
-            if self._estimator.motions.must_wait(message.stamp_ns, now_ns):
-                later.append(message)
-            elif isinstance(message, DroneFix):
-                if self._track_continuity.accepts(message.track_id, message.stamp_ns):
-                    self._estimator.follow(message)
-                    self._estimator.add_fix(message)
-            elif message.R_vehicle_drone is not None and message.covariance_rad2 is not None:
-                self._estimator.add_rotation(
-                    message.stamp_ns, message.R_vehicle_drone, message.covariance_rad2, message.switches
-                )
-        self._waiting = later
+        fixed = self._map_frame.is_fixed(now_ns)
+        if fixed != self._map_was_fixed:  # from now on the map frame moves with the vehicle, or stands
+            self._estimator.start_map()
+        self._map_was_fixed = fixed
+        self._estimator.pass_time(now_ns)
+        heading = at_ns // HEADING_NS > self._published_ns // HEADING_NS
+        self._published_ns = at_ns
+        yield self._pose(at_ns)
+        if heading:
+            yield self._heading(at_ns)
 
     def _pose(self, now_ns: int) -> RelativePose:
         e = self._estimator
-        known = self._known(now_ns) if e.positions.known else None
-        state, reason = state_of(
-            known, e, self.settings.limits, now_ns, self._track_continuity.reason, self._ambiguity(now_ns)
-        )
+        known = self._known(now_ns) if e.known else None
+        state, reason = state_of(known, e, self.settings.limits, now_ns, self._track_continuity.reason)
+        resets = e.resets
         if state is PoseState.LOST or known is None:
-            if known is not None:
-                e.lose()
             self._jumps.lost()
             return lost(now_ns, self._status(PoseState.LOST, reason))
-        self._jumps.see(known, e.resets)
-        return pose(known, self._status(state, reason), e.motions)
-
-    def _ambiguity(self, now_ns: int) -> str:
-        """Why a received rotation is not used; empty: none was received."""
-        unconfirmed_ns = self._estimator.unconfirmed_ns
-        if unconfirmed_ns is not None and now_ns - unconfirmed_ns < AMBIGUOUS_NS:
-            return unconfirmed_reason(self._estimator, unconfirmed_ns)
-        if self._ambiguous_ns is None or now_ns - self._ambiguous_ns >= AMBIGUOUS_NS:
-            return ""
-        return f"rotation known up to a multiple of 90 deg: {self._rotation_reason}"
+        self._jumps.add(known, resets)
+        return pose(known, self._status(state, reason), self._map_frame)
 
     def _status(self, state: PoseState, reason: str) -> Status:
         e = self._estimator
-        resets = e.resets + self._jumps.number
-        return Status(state, reason, e.newest_fix_ns, e.track_id, resets, e.positions.nis, e.vp_rotation_ns, e.raw_yaw)
+        measured_ns, resets = e.fix_ns or e.newest_fix_ns, e.resets + self._jumps.number
+        return Status(state, reason, measured_ns, self._track_id, resets, e.nis, e.measured_rotation_ns, e.odom_yaw)
 
     def _known(self, now_ns: int) -> MapEstimate:
         """The estimate propagated to now, with the bias covariances added."""
         e = self._estimator
-        R, xyz_m, covariance = e.at(now_ns)
-        bias_covariance_m2 = e.positions.bias_covariance_m2
-        yaw_uncertain = R is not None and yaw_sigma_rad(R, covariance) > math.radians(
-            self.settings.limits.yaw_sigma_deg
+        state = e.at(now_ns)
+        R, P = state.R[0], state.covariance[0]
+        whole = np.zeros((6, 6))
+        velocity = state.velocity_mps[0], P[VELOCITY, VELOCITY]
+        if e.decided:
+            axes = np.eye(6)
+            axes[3:, 3:] = R.T  # position in drone axes
+            whole = axes @ P[:6, :6] @ axes.T
+            whole[:3, :3] += e.rotation_bias_rad2 if e.rotation_ns is not None else 0.0
+            whole[3:, 3:] += R.T @ e.bias_covariance_m2 @ R
+            if yaw_sigma_rad(R, whole) <= math.radians(self.settings.limits.yaw_sigma_deg):
+                return MapEstimate(now_ns, R, state.xyz_m[0], whole, *velocity)
+        whole[3:, 3:] = P[POSITION, POSITION] + e.bias_covariance_m2
+        return MapEstimate(now_ns, None, state.xyz_m[0], whole, *velocity)
+
+    def _heading(self, now_ns: int) -> HeadingEstimate:
+        e = self._estimator
+        yaw, sigma, probability, near = _hypotheses(e)
+        reason = "decided" if e.decided else undecided_reason(e, now_ns) if e.known else "no drone is followed"
+        return HeadingEstimate(
+            stamp_ns=now_ns,
+            yaw_map_rad=yaw,
+            sigma_rad=sigma,
+            probability=probability,
+            vehicle_yaw_rad=heading_rad(self._map_frame.vehicle.at(now_ns)[0]),
+            near_probability=near,
+            decided=e.decided,
+            reason=reason,
         )
-        whole = covariance.copy()
-        if R is None or yaw_uncertain:
-            whole[3:, 3:] = bias_covariance_m2 + (
-                covariance[3:, 3:] if R is None else position_covariance(covariance, R)
-            )
-        else:
-            whole[:3, :3] += self.settings.errors.rotation_bias_share * e.chain.rotation_covariance_rad2
-            whole[3:, 3:] += R.T @ bias_covariance_m2 @ R
-        R_known = None if yaw_uncertain else R
-        yaw_sigma = 0.0 if R_known is None else yaw_sigma_rad(R_known, whole)
-        return MapEstimate(now_ns, R_known, xyz_m, whole, *e.positions.velocity(now_ns, R_known, yaw_sigma))
+
+
+def _hypotheses(estimator: Estimator) -> tuple[Array64, Array64, Array64, float]:
+    """Yaw, sigma and probability of each hypothesis, most probable first; probability near the first."""
+    none = np.zeros(0)
+    if estimator.graph.running:
+        state: InertialState = estimator.graph.state
+        return state.yaw_rad, np.sqrt(state.yaw_variance_rad2), np.ones(1), 1.0
+    if estimator.heading.bank is None:
+        return none, none, none, 0.0
+    yaws = estimator.heading.yaws()
+    order = np.argsort(-yaws.weight, kind="stable")
+    order = order[yaws.weight[order] > LEAST_PUBLISHED]
+    sigma = np.sqrt(yaws.variance_rad2[order])
+    return yaws.yaw_rad[order], sigma, yaws.weight[order], estimator.heading.near_probability

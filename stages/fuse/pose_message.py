@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stages.fuse.motion_model import Motions
+from stages.fuse.map_frame import MapFrame
 from stages.geometry.frames import Array64
-from stages.heading.yaw_fit import Yaw
+from stages.heading.odometry_heading import OdomYaw
 from stages.messages import PoseEstimate, PoseState, PositionEstimate, RelativePose
 
 
@@ -41,7 +41,7 @@ class Status:
     resets: int
     nis: float
     rotation_ns: int | None = None
-    odom_yaw: Yaw | None = None
+    odom_yaw: OdomYaw | None = None
 
 
 def lost(stamp_ns: int, status: Status) -> RelativePose:
@@ -49,14 +49,14 @@ def lost(stamp_ns: int, status: Status) -> RelativePose:
     return _message(stamp_ns, status, None, math.nan)
 
 
-def pose(estimate: MapEstimate, status: Status, motions: Motions) -> RelativePose:
+def pose(estimate: MapEstimate, status: Status, map_frame: MapFrame) -> RelativePose:
     """The message with the estimate in `map` and in `vehicle`, there with the uncertainty of the vehicle's motion."""
-    vehicle, stamp_ns = motions.vehicle, estimate.stamp_ns
+    vehicle, stamp_ns = map_frame.vehicle, estimate.stamp_ns
     R_map_vehicle, _ = vehicle.at(stamp_ns)
     xyz, velocity = vehicle.to_vehicle(stamp_ns, estimate.xyz_map_m, estimate.velocity_map_mps)
     R, covariance = estimate.R_map_drone, estimate.covariance
     if R is None:
-        position_m2, _, _ = motions.vehicle_covariance_m2(stamp_ns, xyz)
+        position_m2, _, _ = map_frame.vehicle_covariance_m2(stamp_ns, xyz)
         covariance_m2 = covariance[3:, 3:]
         position = PositionEstimate(
             xyz_vehicle_m=xyz,
@@ -72,7 +72,7 @@ def pose(estimate: MapEstimate, status: Status, motions: Motions) -> RelativePos
     whole = PoseEstimate(
         xyz_vehicle_m=xyz,
         R_vehicle_drone=R_vehicle_drone,
-        covariance=covariance + _vehicle_covariance(motions, stamp_ns, xyz, R_vehicle_drone),
+        covariance=covariance + _vehicle_covariance(map_frame, stamp_ns, xyz, R_vehicle_drone),
         velocity_vehicle_mps=velocity,
         xyz_map_m=estimate.xyz_map_m,
         R_map_drone=R,
@@ -102,12 +102,12 @@ def _message(
     )
 
 
-def _vehicle_covariance(motions: Motions, stamp_ns: int, xyz_vehicle_m: Array64, R: Array64) -> Array64:
+def _vehicle_covariance(map_frame: MapFrame, stamp_ns: int, xyz_vehicle_m: Array64, R: Array64) -> Array64:
     """(6, 6) uncertainty of the vehicle's motion since its newest message, tangent at the drone; R is R_vehicle_drone.
 
     Its shift moves the drone, its yaw turns the drone about the vertical and moves it along the lever arm.
     """
-    position_m2, yaw_rad2, lever = motions.vehicle_covariance_m2(stamp_ns, xyz_vehicle_m)
+    position_m2, yaw_rad2, lever = map_frame.vehicle_covariance_m2(stamp_ns, xyz_vehicle_m)
     covariance = np.zeros((6, 6))
     by_yaw = np.concatenate([R[2], R.T @ lever])
     covariance[3:, 3:] = R.T @ (position_m2 - yaw_rad2 * np.outer(lever, lever)) @ R

@@ -10,6 +10,8 @@ import numpy as np
 from stages.geometry.frames import Array64
 from stages.kernels.geometry.so3 import hat
 
+CHI2_999_3 = 16.27  # 99.9 % quantile of chi-square with 3 degrees of freedom
+
 
 def adjoint(R: Array64, t: Array64) -> Array64:
     """Adjoint (6, 6) of the transform (R, t), rotation first: [[R, 0], [[t]x R, R]]."""

@@ -1,4 +1,4 @@
-"""Yaw of the drone by its motion: yaw branches, or any heading, weighted by the displacements of LiDAR and odometry.
+"""Yaw of the drone's body: a bank of hypotheses by raw IMU, LiDAR positions, vanishing points and odometry.
 
-`align` uses it to publish a rotation, `fuse` to check one.
+`fuse` uses it until the heading is decided. `align` weighs its yaw branches by displacements (hypothesis_bank.py).
 """

@@ -44,20 +44,22 @@ def add_vertical(bank: InertialBank, up_drone: Array64, sigma_rad: float) -> flo
     return bank.update(up_drone - up, H, sigma_rad**2 * np.eye(3), TILT_OUTLIERS, TILT_DENSITY)
 
 
-def nearest_quarter(bank: InertialBank, R_map_drone: Array64, R_map_vehicle: Array64) -> Array64:
-    """(n, 3) residual of each hypothesis against the nearest of four rotations about the vehicle's vertical."""
+def nearest_quarter(R: Array64, R_map_drone: Array64, R_map_vehicle: Array64) -> tuple[Array64, Array64]:
+    """For each of some rotations R (n, 3, 3), the nearest of four, 90 deg apart about the vehicle's vertical.
+
+    Returns the residuals (n, 3) and the nearest rotations (n, 3, 3).
+    """
     four = R_map_vehicle @ QUARTERS @ R_map_vehicle.T @ R_map_drone
-    R = bank.state.R
     off = np.stack([log_rotations(np.swapaxes(R, 1, 2) @ Z) for Z in four], axis=1)
     near = np.argmin(np.linalg.norm(off, axis=2), axis=1)
-    return off[np.arange(len(off)), near]
+    return off[np.arange(len(off)), near], four[near]
 
 
 def add_rotation(bank: InertialBank, R_map_drone: Array64, R_map_vehicle: Array64, covariance_rad2: Array64) -> float:
     """Add a rotation by vanishing points, its branch unknown; covariance in drone axes. Returns P of no outlier."""
     H = np.zeros((len(bank.state), 3, SIZE))
     H[:, :, THETA] = np.eye(3)
-    residual = nearest_quarter(bank, R_map_drone, R_map_vehicle)
+    residual, _ = nearest_quarter(bank.state.R, R_map_drone, R_map_vehicle)
     return bank.update(residual, H, covariance_rad2, ROTATION_OUTLIERS, 4.0 * ROTATION_DENSITY)
 
 

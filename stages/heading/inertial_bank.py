@@ -10,6 +10,12 @@ an outlier share o with a constant density u, so no single one excludes a hypoth
 Hypotheses that agree are merged, improbable ones dropped. A hypothesis with a large yaw sigma is split in three, so
 that the linearisation holds.
 
+START_GYRO_BIAS: ArduPilot averages the gyro at boot until two averages agree within 0.1 deg/s = 0.0017 rad/s
+(AP_InertialSensor::_init_gyro). In the log of a flight (Pixhawk, ArduCopter 3.1.3, two IMUs, 330 s) calibrated gyros
+have a mean of at most 0.0022 rad/s per axis (0.0013 RMS) over the 7 s before take-off; in flight they differ from each
+other by at most 0.0038 per axis (0.0019 RMS for each one, if independent), and the difference changes by 0.0047 at
+take-off. EKF3 assumes 0.0087 (0.5 deg/s) after a calibration. Too small a value makes a wrong yaw look certain.
+
 Source: Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation (2001), 11 (static multiple
 model), and PDA, 3.4 of Bar-Shalom and Li (1995), with one measurement; split: Faubel et al. (2009), 3 components.
 """
@@ -17,6 +23,7 @@ model), and PDA, 3.4 of Bar-Shalom and Li (1995), with one measurement; split: F
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,7 +45,8 @@ STARTS, MOST = 12, 16
 START_TILT_RAD = math.radians(3.0)  # of the autopilot's roll and pitch
 START_YAW_RAD = 0.6 * 2 * math.pi / STARTS
 START_MPS = 4.0  # an unknown velocity, one axis
-START_ACCEL_BIAS, START_GYRO_BIAS = 0.2, 0.007  # [m/s^2], [rad/s] after calibration at the autopilot's boot
+START_ACCEL_BIAS = 0.2  # [m/s^2]
+START_GYRO_BIAS = 0.005  # [rad/s] one axis, after the autopilot's calibration of the gyro at boot; see the docstring
 WIDEST_YAW_RAD = math.radians(22.0)  # a hypothesis with a larger sigma is split
 SPLIT_SHARE, SPLIT_SHIFT, SPLIT_SIGMA = 0.2252, 1.0566, 0.6716
 DROPPED = 1e-8  # a less probable hypothesis is dropped
@@ -46,6 +54,24 @@ ALIKE = 1.0  # squared distance of the yaws over their variances below which two
 ALIKE_RAD = math.radians(3.0)
 NEAR_RAD = math.radians(20.0)
 LEAST_CANDIDATE = 0.05  # a less probable hypothesis is not the best one
+
+
+@dataclass(frozen=True)
+class YawMixture:
+    """Normal densities of a yaw."""
+
+    yaw_rad: Array64  # (n,)
+    variance_rad2: Array64  # (n,)
+    weight: Array64  # (n,) sums to 1
+
+    def best(self) -> tuple[int, float]:
+        """Index of the part with the most probability within 20 deg, and that probability."""
+        sigma = np.sqrt(self.variance_rad2)
+        near = np.zeros(len(sigma))
+        for i in np.flatnonzero(self.weight > LEAST_CANDIDATE):
+            near[i] = _within(self.yaw_rad - self.yaw_rad[i], sigma, NEAR_RAD) @ self.weight
+        best = int(np.argmax(near))
+        return best, float(near[best])
 
 
 class InertialBank:
@@ -137,19 +163,10 @@ class InertialBank:
         self.log_weight = np.append(self.log_weight[rest], log_weight)
         return True
 
-    def near_probability(self, log_factor: Array64 | None = None) -> tuple[int, float]:
-        """Index of the most probable hypothesis, and the probability of a yaw within 20 deg of it.
-
-        `log_factor` (n,): evidence in addition to the weights.
-        """
-        log_weight = self.log_weight if log_factor is None else self.log_weight + log_factor
-        weight = np.exp(log_weight - _log_sum(log_weight))
-        yaw, sigma = self.state.yaw_rad, np.sqrt(self.state.yaw_variance_rad2)
-        near = np.zeros(len(yaw))
-        for i in np.flatnonzero(weight > LEAST_CANDIDATE):
-            near[i] = _within(yaw - yaw[i], sigma, NEAR_RAD) @ weight
-        best = int(np.argmax(near))
-        return best, float(near[best])
+    @property
+    def yaws(self) -> YawMixture:
+        """The yaw of each hypothesis."""
+        return YawMixture(self.state.yaw_rad, self.state.yaw_variance_rad2, self.weight)
 
     def mean(self) -> InertialState:
         """One hypothesis with the moments of all: valid for position and velocity, not for the rotation."""

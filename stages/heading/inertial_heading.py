@@ -3,8 +3,8 @@
 The bank of hypotheses is propagated by the IMU from measurement to measurement, in the order of their times. A
 measurement a little older than the bank is moved to the bank's time by the drone's own motion since.
 
-The heading is decided when the yaws within 20 deg of the best one together have P > 0.999 at DECISIONS consecutive
-LiDAR positions.
+The heading is decided when for DECIDED_FOR_NS, at every LiDAR position, the yaws within 20 deg of the best one together
+have P > 0.999, and the object is the drone (ownership.py): both probabilities may exceed their thresholds for a moment.
 
 Source: ours; issue: heading once.
 """
@@ -18,15 +18,14 @@ import numpy as np
 from stages.geometry.frames import Array64
 from stages.heading import bank_measurements as measure
 from stages.heading.imu_buffer import ImuBuffer
-from stages.heading.inertial_bank import NEAR_RAD, InertialBank, start
+from stages.heading.inertial_bank import NEAR_RAD, InertialBank, YawMixture, start
 from stages.heading.inertial_state import POSITION, ImuIntervals, InertialState
 from stages.heading.odometry_heading import YawEvidence
 from stages.kernels.geometry.so3 import log_rotation
 from stages.messages import VisualMotion
 
-DECIDED, DECISIONS = 0.999, 3
+DECIDED, DECIDED_FOR_NS = 0.999, 800_000_000
 LATE_NS = 500_000_000  # an older measurement is not used
-LATE_MPS2 = 1.5  # change of velocity that moving a late position ignores
 DIRECTION_NS = 400_000_000  # between directions of flight by images that count as independent
 LONGEST_TURN_NS = 300_000_000
 FREE_SIGMA_MPS = 1.0  # of the tracker's velocity
@@ -40,11 +39,10 @@ class InertialHeading:
         self.bank: InertialBank | None = None
         self.stamp_ns = 0
         self.evidence: YawEvidence | None = None
-        self._decisions = 0
+        self._certain_ns: int | None = None  # since when both probabilities have exceeded their thresholds
+        self.decided = False  # whether the heading is known
         self.near_probability = 0.0  # of a yaw within 20 deg of the best one, at the newest LiDAR position
-        self.position_evidence = 0.0  # log density of the newest LiDAR position
         self._direction_ns = 0
-        self.kinds: set[str] = set()  # what has been used since the start
 
     def start(
         self,
@@ -58,13 +56,13 @@ class InertialHeading:
         """Start at a LiDAR position; see `inertial_bank.start`."""
         velocity = None if velocity_mps is None else (velocity_mps, FREE_SIGMA_MPS)
         self.bank = start(xyz_m, covariance_m2, velocity, up_drone, memory)
-        self.stamp_ns, self.evidence, self._decisions = stamp_ns, None, 0
-        self.kinds = set()
+        self.stamp_ns, self.evidence, self._certain_ns, self.decided = stamp_ns, None, None, False
 
     def resume(self, stamp_ns: int, state: InertialState) -> None:
         """Continue from one decided hypothesis (one row)."""
         self.bank = InertialBank(state, np.zeros(1))
-        self.stamp_ns, self.evidence, self._decisions = stamp_ns, None, DECISIONS
+        self.stamp_ns, self.evidence, self.decided = stamp_ns, None, True
+        self._certain_ns = stamp_ns - DECIDED_FOR_NS
 
     def restart_yaw(self) -> None:
         """Reset the yaw to uniform; position and velocity stay."""
@@ -75,7 +73,7 @@ class InertialHeading:
 
     def stop(self) -> None:
         """Drop all hypotheses."""
-        self.bank = None
+        self.bank, self.decided = None, False
 
     def advance(self, stamp_ns: int) -> None:
         """Propagate the bank to a later time."""
@@ -83,20 +81,23 @@ class InertialHeading:
             self.bank.state = self._imu.propagate(self.bank.state, self.bank.weight, self.stamp_ns, stamp_ns)
             self.stamp_ns = stamp_ns
 
-    def add_position(self, stamp_ns: int, xyz_m: Array64, covariance_m2: Array64) -> float | None:
-        """Add a LiDAR position; returns the probability that it is no outlier, or None: too old."""
-        late_s = self._late_s(stamp_ns)
-        if self.bank is None or late_s is None:
+    def add_position(self, xyz_m: Array64, covariance_m2: Array64) -> float | None:
+        """Add a LiDAR position of the bank's time. Returns the log density of the position; None: no bank."""
+        if self.bank is None:
             return None
-        if late_s > 0.0:
-            moved = late_s * (self.bank.weight @ self.bank.state.velocity_mps)
-            xyz_m, covariance_m2 = xyz_m + moved, covariance_m2 + (0.5 * LATE_MPS2 * late_s**2) ** 2 * np.eye(3)
-        inlier = measure.add_position(self.bank, xyz_m, covariance_m2)
-        self.position_evidence = self.bank.log_evidence
+        measure.add_position(self.bank, xyz_m, covariance_m2)
+        log_evidence = self.bank.log_evidence
         self.bank.tidy()
-        self.near_probability = self.bank.near_probability(self.log_factor())[1]
-        self._decisions = self._decisions + 1 if self.near_probability > DECIDED else 0
-        return inlier
+        self.near_probability = self.yaws().best()[1]
+        return log_evidence
+
+    def decide(self, is_own: bool) -> None:
+        """After a LiDAR position: whether the heading is decided; `is_own`: the object is the drone."""
+        if not (is_own and self.near_probability > DECIDED):
+            self._certain_ns = None
+        elif self._certain_ns is None:
+            self._certain_ns = self.stamp_ns
+        self.decided = self._certain_ns is not None and self.stamp_ns - self._certain_ns >= DECIDED_FOR_NS
 
     def add_vertical(self, up_drone: Array64, sigma_rad: float) -> None:
         """Add the autopilot's vertical at the bank's time."""
@@ -112,7 +113,6 @@ class InertialHeading:
             return None
         dR, variance = self.turn(stamp_ns, self.stamp_ns)
         covariance = dR.T @ covariance_rad2 @ dR + variance * np.eye(3)
-        self.kinds.add("vanishing points")
         return measure.add_rotation(self.bank, R_map_drone @ dR, R_map_vehicle, covariance)
 
     def add_visual_motion(self, motion: VisualMotion) -> None:
@@ -130,7 +130,6 @@ class InertialHeading:
         if motion.stamp_ns - self._direction_ns < DIRECTION_NS:
             return
         self._direction_ns = motion.stamp_ns
-        self.kinds.add("direction of flight by images")
         since, _ = self.turn(motion.from_ns, self.stamp_ns)
         late_s = (self.stamp_ns - motion.from_ns) * 1e-9
         measure.add_direction(self.bank, since.T @ motion.direction_from, motion.direction_sigma_rad, late_s)
@@ -143,16 +142,10 @@ class InertialHeading:
         """(6,) mean biases."""
         return np.zeros(6) if self.bank is None else self.bank.weight @ self.bank.state.bias
 
-    def log_factor(self) -> Array64 | None:
-        """(n,) evidence of the autopilot's odometry, which is not part of the weights: its error is constant."""
-        if self.bank is None or self.evidence is None:
-            return None
-        return self.evidence.log_density(self.bank.state.yaw_rad, self.bank.state.yaw_variance_rad2)
-
-    @property
-    def decided(self) -> bool:
-        """Whether the heading is known."""
-        return self.bank is not None and self._decisions >= DECISIONS
+    def yaws(self) -> YawMixture:
+        """The yaw with the evidence of the autopilot's odometry, which is not in the bank: its error is constant."""
+        assert self.bank is not None
+        return self.bank.yaws if self.evidence is None else self.evidence.applied(self.bank.yaws)
 
     def decision(self) -> InertialState:
         """One hypothesis: the moments of those near the best one.
@@ -160,10 +153,9 @@ class InertialHeading:
         The odometry's yaw is evidence for the decision alone: the error of its compass must not reach the estimate.
         """
         assert self.bank is not None
-        bank, factor = self.bank, self.log_factor()
-        best, _ = bank.near_probability(factor)
-        yaw = bank.state.yaw_rad
-        near = np.flatnonzero(np.abs(np.remainder(yaw - yaw[best] + math.pi, 2 * math.pi) - math.pi) <= 1.5 * NEAR_RAD)
+        bank, yaws = self.bank, self.yaws()
+        off = bank.state.yaw_rad - yaws.yaw_rad[yaws.best()[0]]
+        near = np.flatnonzero(np.abs(np.remainder(off + math.pi, 2 * math.pi) - math.pi) <= 1.5 * NEAR_RAD)
         return InertialBank(bank.state.rows(near), bank.log_weight[near]).mean()
 
     def _late_s(self, stamp_ns: int) -> float | None:

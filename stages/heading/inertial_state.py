@@ -10,6 +10,7 @@ Source: Forster et al. (T-RO 2017); Sola, Quaternion kinematics for the error-st
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -156,3 +157,8 @@ def predict_free(state: InertialState, seconds: float, turn: Array64, variance_r
     symmetric = 0.5 * (P + np.swapaxes(P, 1, 2))
     xyz_m = state.xyz_m + T * state.velocity_mps
     return InertialState(state.R @ turn, xyz_m, state.velocity_mps, state.bias, symmetric)
+
+
+def yaw_sigma_rad(R: Array64, covariance: Array64) -> float:
+    """Sigma of the rotation about the vertical [rad]; R (3, 3), and a covariance whose first block is its tangent's."""
+    return math.sqrt(max(float(R[2] @ covariance[:3, :3] @ R[2]), 0.0))

@@ -14,6 +14,8 @@ from stages.messages.autopilot import DroneImu as DroneImu
 from stages.messages.autopilot import DroneLocalPosition as DroneLocalPosition
 from stages.messages.autopilot import DroneOdometry as DroneOdometry
 from stages.messages.autopilot import DroneTilt as DroneTilt
+from stages.messages.autopilot import EarlierOdomFrame as EarlierOdomFrame
+from stages.messages.autopilot import HeadingPrior as HeadingPrior
 from stages.messages.cameras import BranchState as BranchState
 from stages.messages.cameras import CameraMount as CameraMount
 from stages.messages.cameras import FollowedFeatures as FollowedFeatures

@@ -90,3 +90,26 @@ class AutopilotEstimator(Message):
     height_ratio: float
     compass_ratio: float
     flags: int  # flags as received
+
+
+@message(schema=85)
+class EarlierOdomFrame(Message):
+    """Frame odom in `map`, R_map_odom = Rz(yaw), as an earlier run of grd knew it at a pose that it sent."""
+
+    yaw_map_odom_rad: float
+    sigma_rad: float  # of the yaw
+    xyz_map_m: Vec3  # origin of odom
+
+
+@message(schema=86)
+class HeadingPrior(Message):
+    """Yaw and position of the drone after a restart of grd in flight, by the autopilot's own propagation since.
+
+    Valid if frame odom has not changed since the earlier run: then the LiDAR position is near this one.
+    """
+
+    yaw_map_rad: float  # of the body
+    yaw_map_odom_rad: float  # of frame odom, R_map_odom = Rz(yaw)
+    sigma_rad: float  # of both
+    xyz_map_m: Vec3
+    position_sigma_m: float  # one horizontal axis

@@ -17,7 +17,7 @@ class HeadingEstimate(Message):
     probability: PerPointF64  # sums to 1
     vehicle_yaw_rad: float  # yaw of R_map_vehicle at stamp_ns
     near_probability: float  # probability of a yaw within 20 deg of the first one
-    decided: bool  # near_probability has exceeded 0.999 and no evidence since has contradicted it
+    decided: bool  # near_probability has exceeded 0.999 for 0.8 s and the object is the drone
     reason: str  # what the estimate rests on, or why it is not decided
 
     @property

@@ -19,7 +19,7 @@ class LidarFirings(Message):
     """
 
     pulse_stamp_ns: PerPointI64  # firing time of each pulse
-    laser: PerPointU8  # 0..15, the packet's channel order
+    laser: PerPointU8  # number in the packet's channel order
     azimuth_rad: PerPointF32  # 0 along +y_lidar, clockwise seen from +z_lidar, [0, 2 pi)
     range_m: PerPointF32  # 0: no return
     reflectivity: PerPointU8  # 0..255, calibrated by the sensor

@@ -1,43 +1,37 @@
 """Time per message of the fusion: `python -m pytest tests/benchmarks/bench_fuse.py`. Goal: p99 2 ms, one core.
 
-Side by side: the smoother and the Kalman filter, over one flight of 12 s; the parts of both.
+Side by side: a LiDAR position in the bank of hypotheses and in the graph; the fixed-lag update against solving the
+window again in batch.
 """
 
 from __future__ import annotations
 
 import time
 
+import gtsam
 import numpy as np
 import pytest
 
 from stages.fuse import Fuse
-from stages.fuse.motion_model import Step
-from stages.fuse.settings import FuseErrors
-from stages.fuse.smoother import Smoother
-from stages.geometry.frames import rotation_z
-from stages.heading.motion_yaw import weigh
-from tests.stages.fuse.ekf import Ekf, EkfFuse
-from tests.stages.fuse.made_drone_flight import Made
-from tests.stages.heading.test_motion_yaw import circle, points
+from tests.stages.fuse.imu_flights import ImuFlight
 
-STAGES = {"smoother": Fuse, "ekf": EkfFuse}
-BACKS = {"smoother": lambda: Smoother(3.0), "ekf": Ekf}
-TENTH = 100_000_000
-STEP = Step(rotation_z(0.05), np.array([0.3, 0.0, 0.0]), np.diag([0.002**2] * 3 + [0.01**2] * 3), True, True)
-STAYS = Step(np.eye(3), np.zeros(3), np.zeros((6, 6)), True, True)
+FLIGHTS = {
+    "graph": ImuFlight(kind="fast", seed=2, until_s=12.0, vehicle_mps=3.0, rotations=True, images=True),
+    "bank": ImuFlight(kind="hover", seed=1, until_s=12.0, wind_mps=0.0),
+}
 
 
-@pytest.mark.parametrize("name", STAGES)
+@pytest.mark.parametrize("name", FLIGHTS)
 def test_every_message_of_a_flight(benchmark, name):
     """One round is a flight; the extra info is by port, of each message with all that follows from it, poses included.
 
     In CPU time of the thread: on a machine that others use too, what they take is not ours.
     """
-    events = Made(vehicle_mps=3.0, vehicle_dps=10.0).events()
+    events = FLIGHTS[name].events()
     took: dict[str, list[float]] = {}
 
     def fly():
-        stage = STAGES[name]()
+        stage = Fuse()
         for _, port, message in events:
             began = time.thread_time()
             tuple(getattr(stage, f"on_{port}")(message))
@@ -53,41 +47,35 @@ def test_every_message_of_a_flight(benchmark, name):
         print(f"{name} {port}: {benchmark.extra_info[port]}")  # noqa: T201
 
 
-def flown(name, steps=40):
-    back = BACKS[name]()
-    back.start(0, np.eye(3), np.zeros(3), 0.01 * np.eye(6))
-    for k in range(1, steps):
-        back.extend(k * TENTH, STEP, None, 0.1)
-    return back
+def flown(name):
+    """The stage after a flight."""
+    stage = Fuse()
+    for _, port, message in FLIGHTS[name].events():
+        tuple(getattr(stage, f"on_{port}")(message))
+    return stage
 
 
-@pytest.mark.parametrize("name", BACKS)
-def test_one_pose_more(benchmark, name):
-    back = flown(name)
-    benchmark.pedantic(lambda: back.extend(back.stamp_ns + TENTH, STEP, None, 0.1), rounds=300, warmup_rounds=10)
-
-
-@pytest.mark.parametrize("name", BACKS)
-def test_one_position(benchmark, name):
-    back = flown(name)
-
-    def setup():
-        back.extend(back.stamp_ns + TENTH, STEP, None, 0.1)
-
-    def add():
-        back.add_position(back.stamp_ns, STAYS, back.xyz_map_m + 0.02, 0.0025 * np.eye(3))
-
-    benchmark.pedantic(add, setup=setup, rounds=300, warmup_rounds=10)
-
-
-@pytest.mark.parametrize("name", STAGES)
+@pytest.mark.parametrize("name", FLIGHTS)
 def test_a_prediction(benchmark, name):
-    stage = STAGES[name]()
-    made = Made(until_s=6.0)
-    made.run(stage)
-    now_ns = stage._intake.now_ns
-    benchmark(lambda: stage._pose(now_ns))
+    stage = flown(name)
+    assert stage._estimator.graph.running == (name == "graph")
+    benchmark(lambda: stage._pose(stage._intake.now_ns))
 
 
-def test_a_heading_by_motion(benchmark):
-    benchmark(weigh, points(circle(48), step_s=0.6), FuseErrors())
+def test_one_position_by_the_fixed_lag_smoother(benchmark):
+    graph = flown("graph")._estimator.graph
+    benchmark.pedantic(
+        lambda: graph.add_position(graph.stamp_ns, graph.state.xyz_m[0] + 0.02, 0.01 * np.eye(3), graph.state),
+        rounds=30,
+    )
+    assert graph.recoveries == 0
+
+
+def test_the_same_window_in_batch(benchmark):
+    smoother = flown("graph")._estimator.graph._smoother
+    factors, values = smoother.getFactors(), smoother.calculateEstimate()
+    batch = gtsam.NonlinearFactorGraph()
+    for i in range(factors.size()):
+        if factors.at(i) is not None:
+            batch.add(factors.at(i))
+    benchmark.pedantic(lambda: gtsam.LevenbergMarquardtOptimizer(batch, values).optimize(), rounds=30)

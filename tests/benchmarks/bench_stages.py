@@ -16,8 +16,8 @@ import pytest
 import yaml
 
 from links.dynamixel import Servo
+from links.lidar import Lidar
 from links.recording import RecordingReader
-from links.velodyne import Lidar
 from stages.detect import EvidenceDetect, KernelDetect
 from stages.detect.kernel_candidates import inner_half_px, score_image
 from stages.geometry.frames import LidarMount

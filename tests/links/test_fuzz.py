@@ -37,15 +37,16 @@ from flow.remote.codec import MAX_BYTES, CodecError, decode, encode
 from links.camera import Camera
 from links.dynamixel.bus import BlockingPort, Bus, BusError
 from links.dynamixel.servo import Servo
+from links.lidar import Lidar
+from links.lidar.position import PpsMonitor
 from links.mavlink import Autopilot
 from links.mavlink.transport.framing import FrameSplitter, dialect, frame_bytes
 from links.recording import CompressedImage, RecordingReader, RecordingWriter, encode_compressed_image
 from links.simulated.sensors.protocol2 import status
 from links.vehicle_odometry import VehicleOdometry
-from links.velodyne import Lidar
-from links.velodyne.position import PpsMonitor
 from links.zenoh.envelope import read_envelope
 from stages import messages
+from tests.links.fuzz_files import files
 
 pytestmark = pytest.mark.slow
 
@@ -367,6 +368,8 @@ def test_a_million_mutated_inputs_cause_no_crash_timeout_or_growth(tmp_path):
         vlp16(), position(), mavlink_frames(), servo_replies(), servo_json(), odometry_json(), camera_frames(),
         zenoh_messages(), mcap_files(tmp_path), yaml_files(tmp_path), hosts_files(tmp_path),
     ]  # fmt: skip
+    for name, count, take, errors, good, text in files(tmp_path):
+        formats.append(InputFormat(name, count, take, errors, Mutator(good, text=text)))
     lines = [f"{'format':22}{'inputs':>9}{'raised %':>9}{'time [s]':>9}{'worst [ms]':>11}{'RSS [MB]':>9}{'growth':>9}"]
     for input_format in formats:
         lines.append(fuzz(input_format))

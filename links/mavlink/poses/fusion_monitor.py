@@ -4,12 +4,16 @@ EKF_STATUS_REPORT (ArduPilot) and ESTIMATOR_STATUS have the innovation test rati
 is rejected. Neither says which source is meant, so the ratio counts only while poses are sent. The stream is not useful
 then, and a reset to a pose that contradicts the autopilot's own sensors may be wrong. What follows is a setting:
 
-    stop     no poses until the ratio was below RESUME for RESUME_NS (default)
+    stop     no poses until the ratio was below RESUME_BELOW for RESUME_AFTER_NS (default)
     reset    the reset counter changes, so that the EKF takes the pose; after MAX_RESETS in a row as `stop`
     report   only a text and a counter
 
-Source: ours; ArduPilot NavEKF3_core::send_status_report (square roots of ratios), FS_EKF_THRESH 0.8 for 1 s;
-https://mavlink.io/en/messages/common.html#ESTIMATOR_STATUS.
+MAX_REJECTED_NS is shorter than the second after which the EKF failsafe acts. ArduPilot's position times out 7 s after
+the last fused pose: within RESUME_AFTER_NS it is known whether a position is accepted again; a reset that holds for
+RESETS_FORGOTTEN_NS was right.
+
+Source: ours; ArduPilot NavEKF3_core::send_status_report (square roots of ratios), ekf_check.cpp (FS_EKF_THRESH 0.8 for
+1 s), posRetryTimeNoVel_ms; https://mavlink.io/en/messages/common.html#ESTIMATOR_STATUS.
 """
 
 from __future__ import annotations
@@ -19,11 +23,11 @@ from typing import Any, Literal
 
 OnRejection = Literal["stop", "reset", "report"]
 
-REJECTED_NS = 600_000_000  # ratio above 1 for so long, before ArduPilot's failsafe of 1 s
-RESUME, RESUME_NS = 0.5, 3_000_000_000
+MAX_REJECTED_NS = 600_000_000  # ratio above 1 for so long, before ArduPilot's failsafe of 1 s
+RESUME_BELOW, RESUME_AFTER_NS = 0.5, 3_000_000_000  # half the innovation that the gate allows, as preflight warns of
 MAX_RESETS = 3
-SETTLED_NS = 5_000_000_000  # without rejection, after which resets are counted again from zero
-STALE_NS = 2_000_000_000  # between two status messages: no statement in between
+RESETS_FORGOTTEN_NS = 5_000_000_000  # without rejection, after which resets are counted again from zero
+MAX_STATUS_GAP_NS = 2_000_000_000  # between two status messages: no statement in between
 
 
 class FusionMonitor:
@@ -37,7 +41,7 @@ class FusionMonitor:
         self._action: OnRejection = on_rejection
         self._resets = 0
         self._above_ns: int | None = None  # since when the ratio is above 1
-        self._below_ns: int | None = None  # since when it is below RESUME
+        self._below_ns: int | None = None  # since when it is below RESUME_BELOW
         self._newest_ns: int | None = None
         self._rejected_ns: int | None = None
 
@@ -46,14 +50,14 @@ class FusionMonitor:
         ratio = _ratio(message)
         if ratio is None:
             return None
-        if self._newest_ns is None or now_ns - self._newest_ns > STALE_NS:
+        if self._newest_ns is None or now_ns - self._newest_ns > MAX_STATUS_GAP_NS:
             self._above_ns = self._below_ns = None
         self._newest_ns = now_ns
         self._above_ns = (self._above_ns or now_ns) if ratio > 1 and (sending or self.stopped) else None
-        self._below_ns = (self._below_ns or now_ns) if ratio < RESUME else None
-        if self.stopped and self._below_ns is not None and now_ns - self._below_ns >= RESUME_NS:
+        self._below_ns = (self._below_ns or now_ns) if ratio < RESUME_BELOW else None
+        if self.stopped and self._below_ns is not None and now_ns - self._below_ns >= RESUME_AFTER_NS:
             self.stopped = False
-        if self.stopped or self._above_ns is None or now_ns - self._above_ns < REJECTED_NS:
+        if self.stopped or self._above_ns is None or now_ns - self._above_ns < MAX_REJECTED_NS:
             return None
         return self._reject(ratio, now_ns)
 
@@ -63,7 +67,7 @@ class FusionMonitor:
         self._above_ns = self._below_ns = self._newest_ns = self._rejected_ns = None
 
     def _reject(self, ratio: float, now_ns: int) -> tuple[str, bool]:
-        settled = self._rejected_ns is None or now_ns - self._rejected_ns > SETTLED_NS
+        settled = self._rejected_ns is None or now_ns - self._rejected_ns > RESETS_FORGOTTEN_NS
         self._resets = 0 if settled else self._resets
         self.rejections += 1
         self._rejected_ns, self._above_ns = now_ns, None

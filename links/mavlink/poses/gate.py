@@ -21,7 +21,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from stages.messages import PoseEstimate, PoseState, RelativePose
 
-AHEAD_NS = 50_000_000  # a pose further in the future has another clock
+MAX_AHEAD_NS = 50_000_000  # a pose further in the future has another clock
 SENDABLE = (PoseState.FULL, PoseState.COASTING)
 ROTATION_ERROR = 1e-6  # limit of |R^T R - 1|
 
@@ -100,7 +100,7 @@ def age_reason(stamp_ns: int, now_ns: int, limits: PoseLimits) -> RejectReason |
     age_ns = now_ns - stamp_ns
     if age_ns > 1e9 * limits.age_s:
         return RejectReason.OLD
-    return RejectReason.FUTURE if age_ns < -AHEAD_NS else None
+    return RejectReason.FUTURE if age_ns < -MAX_AHEAD_NS else None
 
 
 @lru_cache(maxsize=1)  # used by the gate and for the message's quality

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections import deque
 
-from links.mavlink.timesync_monitor import LATE_NS
+from links.mavlink.timesync_monitor import MAX_LATENCY_NS
 
 POSES = frozenset({"ODOMETRY", "VISION_POSITION_ESTIMATE"})  # messages that enter an EKF
 MAX_PENDING = 65_536  # poses sent while nothing is received: 20 minutes at 50 Hz; then the oldest are dropped
@@ -53,4 +53,4 @@ class Independence:
             self._sent_ns = max(self._pending.popleft(), self._sent_ns or 0)
         if self._sent_ns is None:
             return True
-        return self._booted_ns is not None and self._sent_ns < self._booted_ns - LATE_NS
+        return self._booted_ns is not None and self._sent_ns < self._booted_ns - MAX_LATENCY_NS

@@ -22,22 +22,22 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from links.mavlink.poses.attitude_monitor import AttitudeMonitor
+from links.mavlink.poses.autopilot_estimate import AutopilotEstimate
 from links.mavlink.poses.fusion_monitor import FusionMonitor, OnRejection
 from links.mavlink.poses.gate import PoseLimits, RejectReason, reject_reason
 from links.mavlink.poses.pose_messages import landing_target, odometry, vision_position_estimate
 from links.mavlink.poses.position_gate import gate_reason
-from links.mavlink.poses.position_messages import OwnAttitude, position_odometry, position_vision_estimate
+from links.mavlink.poses.position_messages import position_odometry, position_vision_estimate
 from links.mavlink.poses.status_texts import StatusTexts
 from links.mavlink.profiles import ProfileName, YawOutput
 from links.mavlink.transport.framing import SEQUENCE
 from stages.geometry.frames import Array64
-from stages.messages import RelativePose
+from stages.messages import PoseState, RelativePose
 
 PoseMessage = Literal["odometry", "vision_position_estimate", "landing_target"]
 
-SILENCE_NS = 300_000_000  # the autopilot's timeout for poses
-ATTITUDE_NS = 1_000_000_000  # largest age of the autopilot's attitude
+POSE_TIMEOUT_NS = 300_000_000  # the autopilot's timeout for poses
+MAX_ATTITUDE_AGE_NS = 1_000_000_000  # largest age of the autopilot's attitude
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +69,6 @@ class PoseSender:
         self._limits = limits
         self._yaw: YawOutput = yaw
         self._profile: ProfileName = profile
-        self._attitude: OwnAttitude | None = None
         self._poses_sent = self._yaw_reset = False  # since the autopilot's boot
         self._odom_yaw_rad: float | None = None  # of the newest pose that had one
         self._other_boot_rad: float | None = None  # yaw of its axes before its newest boot: not valid any more
@@ -80,9 +79,15 @@ class PoseSender:
         self._newest_ns: int | None = None  # stamp of the newest pose of which anything was sent
         self._incremented = False  # the reset counter, since `_sent`
         self._sending = False
-        self.texts = StatusTexts()
+        sufficient = (PoseState.FULL, PoseState.POSITION_ONLY) if yaw == "none" else (PoseState.FULL,)
+        self.texts = StatusTexts(sufficient)
         self.fusion = FusionMonitor(on_rejection)
-        self.attitude = AttitudeMonitor()
+        self.autopilot = AutopilotEstimate()
+
+    @property
+    def sends_yaw(self) -> bool:
+        """Whether the poses contain the yaw."""
+        return self._yaw == "measured"
 
     @property
     def sending(self) -> bool:
@@ -106,10 +111,6 @@ class PoseSender:
         else:
             self._update_reset_counter(pose, now_ns)
         return [self._message(kind, pose) for kind in sendable]
-
-    def on_attitude(self, attitude: OwnAttitude) -> None:
-        """The autopilot's own attitude: positions for ArduPilot contain it."""
-        self._attitude = attitude
 
     def on_yaw_reset(self) -> None:
         """The autopilot has reset its yaw. Once its telemetry contains our poses, its axes are then unknown."""
@@ -144,8 +145,8 @@ class PoseSender:
             self.texts.on_sending(now_ns)
 
     def due_texts(self, now_ns: int) -> list[Any]:
-        """The STATUSTEXT that is due, if any. Also detects that no pose has been sent for SILENCE_NS."""
-        if self._sending and self._sent is not None and now_ns - self._sent.at_ns > SILENCE_NS:
+        """The STATUSTEXT that is due, if any. Also detects that no pose has been sent for POSE_TIMEOUT_NS."""
+        if self._sending and self._sent is not None and now_ns - self._sent.at_ns > POSE_TIMEOUT_NS:
             self._stop("no poses sent")
         return self.texts.due(now_ns)
 
@@ -158,7 +159,7 @@ class PoseSender:
         last = self._sent
         if last is None or self._incremented:
             return
-        if now_ns - last.at_ns > SILENCE_NS or pose.resets != last.resets or pose.track_id != last.track_id:
+        if now_ns - last.at_ns > POSE_TIMEOUT_NS or pose.resets != last.resets or pose.track_id != last.track_id:
             self.reset_counter = (self.reset_counter + 1) % SEQUENCE
             self._incremented = True
 
@@ -177,8 +178,8 @@ class PoseSender:
 
     def _axes_reason(self, pose: RelativePose, now_ns: int) -> RejectReason | None:
         """Why the autopilot's axes are not those that were learnt. The first ATTITUDE after a silence shows a boot."""
-        own = self._attitude
-        if own is None or now_ns - own.arrival_ns > ATTITUDE_NS:
+        attitude = self.autopilot.attitude
+        if attitude is None or now_ns - attitude.arrival_ns > MAX_ATTITUDE_AGE_NS:
             return RejectReason.NO_ATTITUDE
         if self._yaw_reset:
             return RejectReason.ODOM_YAW_RESET
@@ -204,8 +205,8 @@ class PoseSender:
         return landing_target(pose)
 
     def _position_message(self, kind: PoseMessage, pose: RelativePose) -> Any:
-        own = self._attitude if self._profile == "ardupilot" else None
+        attitude = self.autopilot.attitude if self._profile == "ardupilot" else None
         if kind == "odometry":
-            return position_odometry(pose, self.reset_counter, self._limits, own, self._moved_m(pose))
-        assert own is not None  # PX4 has no VISION_POSITION_ESTIMATE
-        return position_vision_estimate(pose, self.reset_counter, own, self._moved_m(pose))
+            return position_odometry(pose, self.reset_counter, self._limits, attitude, self._moved_m(pose))
+        assert attitude is not None  # PX4 has no VISION_POSITION_ESTIMATE
+        return position_vision_estimate(pose, self.reset_counter, attitude, self._moved_m(pose))

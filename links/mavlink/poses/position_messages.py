@@ -14,12 +14,12 @@ Ekf::controlEvPosFusion (LOCAL_FRAME_NED, LOCAL_FRAME_FRD), Ekf::controlEvYawFus
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from links.mavlink.ned_frd import R_odom_drone_from_rpy, flip_yz, upper_from_pose_covariance, wxyz_from_R_odom_drone
+from links.mavlink.poses.autopilot_estimate import AutopilotAttitude
 from links.mavlink.poses.gate import PoseLimits
 from links.mavlink.poses.pose_messages import BODY_FRD, LOCAL_FRD, UNKNOWN, UNKNOWN_COVARIANCE, VIO
 from links.mavlink.poses.position_gate import odom_position, position_quality_percent
@@ -31,30 +31,20 @@ TILT_RAD2 = math.radians(2.0) ** 2  # of the autopilot's own roll and pitch
 NO_YAW_RAD2 = math.pi**2  # of a yaw that is not measured
 
 
-@dataclass(frozen=True, slots=True)
-class OwnAttitude:
-    """The autopilot's attitude as it reported it: NED, FRD."""
-
-    roll_rad: float
-    pitch_rad: float
-    yaw_rad: float
-    arrival_ns: int
-
-
 def position_odometry(
-    pose: RelativePose, reset_counter: int, limits: PoseLimits, own: OwnAttitude | None, moved_m: float = 0.0
+    pose: RelativePose, reset_counter: int, limits: PoseLimits, attitude: AutopilotAttitude | None, moved_m: float = 0.0
 ) -> Any:
-    """ODOMETRY of a position that the gate has accepted. `own`: for ArduPilot; None: for PX4. `moved_m`: see there."""
+    """ODOMETRY of a position that the gate has accepted. `attitude` None: for PX4. `moved_m`: see `odom_position`."""
     position = odom_position(pose, moved_m)
     return dialect().MAVLink_odometry_message(
         pose.stamp_ns // 1000,
-        LOCAL_NED if own is None else LOCAL_FRD,
+        LOCAL_NED if attitude is None else LOCAL_FRD,
         BODY_FRD,
         *flip_yz(position.xyz_odom_m),
-        [math.nan] * 4 if own is None else wxyz_from_R_odom_drone(R_odom_drone_from_rpy(*_angles(own))),
+        [math.nan] * 4 if attitude is None else wxyz_from_R_odom_drone(R_odom_drone_from_rpy(*_angles(attitude))),
         *UNKNOWN,
         *UNKNOWN,
-        _upper(position.covariance_m2, TILT_RAD2, NO_YAW_RAD2) if own else _upper(position.covariance_m2),
+        _upper(position.covariance_m2, TILT_RAD2, NO_YAW_RAD2) if attitude else _upper(position.covariance_m2),
         UNKNOWN_COVARIANCE,
         reset_counter % SEQUENCE,
         VIO,
@@ -62,20 +52,22 @@ def position_odometry(
     )
 
 
-def position_vision_estimate(pose: RelativePose, reset_counter: int, own: OwnAttitude, moved_m: float = 0.0) -> Any:
-    """VISION_POSITION_ESTIMATE of a position that the gate has accepted; for ArduPilot. `moved_m`: see the gate."""
+def position_vision_estimate(
+    pose: RelativePose, reset_counter: int, attitude: AutopilotAttitude, moved_m: float = 0.0
+) -> Any:
+    """VISION_POSITION_ESTIMATE of an accepted position, for ArduPilot. `moved_m`: see `odom_position`."""
     position = odom_position(pose, moved_m)
     return dialect().MAVLink_vision_position_estimate_message(
         pose.stamp_ns // 1000,
         *flip_yz(position.xyz_odom_m),
-        *_angles(own),
+        *_angles(attitude),
         _upper(position.covariance_m2, TILT_RAD2, NO_YAW_RAD2),
         reset_counter % SEQUENCE,
     )
 
 
-def _angles(own: OwnAttitude) -> tuple[float, float, float]:
-    return own.roll_rad, own.pitch_rad, own.yaw_rad
+def _angles(attitude: AutopilotAttitude) -> tuple[float, float, float]:
+    return attitude.roll_rad, attitude.pitch_rad, attitude.yaw_rad
 
 
 def _upper(position_m2: Any, tilt_rad2: float = math.nan, yaw_rad2: float = math.nan) -> list[float]:

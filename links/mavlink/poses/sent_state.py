@@ -4,6 +4,9 @@ The next session reports that pose once as a sent frame, with the time at which 
 with the autopilot's boot, live and in replay alike (`independence.py`): until the autopilot reboots, its estimate is
 not independent. Without a file every start is taken as the first one since the autopilot's boot.
 
+With the pose the autopilot's local frame in `map` is kept (`odom_frame.py`). The next session reports it as the first
+received frame, and a stage decides whether it still holds.
+
 Times are host times. If the wall clock of a host without a battery is set between two runs, they are wrong: see
 deploy/grd.service, which orders grd after time-sync.
 
@@ -14,58 +17,72 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 from links.mavlink.transport.framing import dialect
 
-WRITE_NS = 1_000_000_000  # period of writing
+WRITE_PERIOD_NS = 1_000_000_000  # period of writing
 
 
 class SentState:
-    """Reads the file when it is made; `write` is called regularly, by one thread, and may block."""
+    """One per run. Reads the file when it is made; `write` is called regularly, by one thread, and may block."""
 
     def __init__(self, file: Path | None, now_ns: int) -> None:
         self.status: str | None = None
         """Why the file cannot be read or written."""
         self._file = file
         self._newest: tuple[int, bytes] | None = None
+        self._odom: bytes | None = None
         self._written_ns: int | None = None
-        self.earlier = self._read(now_ns)
-        """Time and frame of the newest pose of earlier runs; None: none."""
+        self._earlier = self._read(now_ns)
 
-    def on_sent(self, frame: bytes, sent_ns: int) -> None:
-        """A pose was sent."""
+    def take_earlier(self) -> tuple[int, bytes, bytes | None] | None:
+        """Time and frame of the newest pose of earlier runs, and frame odom in `map` then; None: none, or taken before.
+
+        A link that is reopened has another session of the same run: what this run knew then is not reported.
+        """
+        earlier, self._earlier = self._earlier, None
+        return earlier
+
+    def on_sent(self, frame: bytes, sent_ns: int, odom: Callable[[], bytes | None] = lambda: None) -> None:
+        """A pose was sent; `odom`: makes frame odom in `map`, called when it will be written."""
         self._newest = sent_ns, frame
+        if self._file is not None and (self._written_ns is None or sent_ns - self._written_ns >= WRITE_PERIOD_NS):
+            self._odom = odom()
 
     def write(self) -> None:
         """Write the newest pose, at most once a second. Until it succeeds it is repeated."""
         newest = self._newest
         if self._file is None or newest is None or newest[0] == self._written_ns:
             return
-        if self._written_ns is not None and newest[0] - self._written_ns < WRITE_NS:
+        if self._written_ns is not None and newest[0] - self._written_ns < WRITE_PERIOD_NS:
             return
         partial = self._file.with_suffix(".partial")
         try:
             self._file.parent.mkdir(parents=True, exist_ok=True)
-            partial.write_text(json.dumps({"sent_ns": newest[0], "frame": newest[1].hex()}), encoding="ascii")
+            fields = {"sent_ns": newest[0], "frame": newest[1].hex(), "odom": self._odom and self._odom.hex()}
+            partial.write_text(json.dumps(fields), encoding="ascii")
             os.replace(partial, self._file)
         except OSError as error:
             self.status = f"{self._file} cannot be written: {error.strerror}. A restart would not know of sent poses"
         else:
             self._written_ns, self.status = newest[0], None
 
-    def _read(self, now_ns: int) -> tuple[int, bytes] | None:
+    def _read(self, now_ns: int) -> tuple[int, bytes, bytes | None] | None:
         """A file that cannot be read counts as a pose sent now."""
         if self._file is None:
             return None
         try:
             fields = json.loads(self._file.read_text(encoding="ascii"))
-            return min(int(fields["sent_ns"]), now_ns), bytes.fromhex(fields["frame"])
+            sent_ns, frame = int(fields["sent_ns"]), bytes.fromhex(fields["frame"])
+            odom = fields.get("odom")
+            return max(0, min(sent_ns, now_ns)), frame, None if odom is None else bytes.fromhex(odom)
         except FileNotFoundError:
             return None
-        except (OSError, ValueError, TypeError, KeyError) as error:
+        except (OSError, ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
             self.status = f"{self._file} cannot be read ({error!r}): delete it after a reboot of the autopilot"
-            return now_ns, _unknown_pose()
+            return now_ns, _unknown_pose(), None
 
 
 def _unknown_pose() -> bytes:

@@ -1,11 +1,11 @@
 """STATUSTEXT about the output: which text, when, and short enough.
 
-    output   "STOPPED: " and the reason (critical) as soon as poses stop; "sending poses" (notice) after HOLD_NS of them
+    output   "STOPPED: " and the reason (critical) as soon as poses stop; "sending poses" (notice) after 1 s of them
     link     warnings about the link and the autopilot
-    state    state of the pose and the first clause of its reason, once it has lasted for HOLD_NS
+    state    state of the pose and the first clause of its reason, once it has lasted for 1 s
 
-At most one text in TEXT_NS is sent, the newest of the most important kind; a text is kept until it was sent or
-replaced. A text ends at a word within the 50 bytes of the field; run.log has all of it.
+At most one text in 2 s is sent, the newest of the most important kind; a text is kept until it was sent or replaced. A
+text ends at a word within the 50 bytes of the field; run.log has all of it.
 
 Source: ours; https://mavlink.io/en/messages/common.html#STATUSTEXT.
 """
@@ -13,6 +13,7 @@ Source: ours; https://mavlink.io/en/messages/common.html#STATUSTEXT.
 from __future__ import annotations
 
 import re
+from collections.abc import Collection
 from typing import Any, Literal, get_args
 
 from links.mavlink.transport.framing import dialect
@@ -20,12 +21,11 @@ from stages.messages import PoseState
 
 TextKind = Literal["output", "link", "state"]  # in order of priority
 
-TEXT_NS = 2_000_000_000  # minimum interval of texts
-HOLD_NS = 1_000_000_000  # a state, or sending, is reported after it has lasted so long
+MIN_TEXT_INTERVAL_NS = 2_000_000_000  # minimum interval of texts
+MIN_STATE_DURATION_NS = 1_000_000_000  # a state, or sending, is reported after it has lasted so long
 TEXT_BYTES = 50  # size of STATUSTEXT's text field
 PREFIX = "grd: "
 CRITICAL, WARNING, NOTICE, INFO = 2, 4, 5, 6  # MAV_SEVERITY
-SEVERITY = {PoseState.FULL: INFO, PoseState.COASTING: WARNING}  # of a state; other states: warning
 CLAUSE = re.compile(r"[;:,]")
 
 
@@ -41,7 +41,9 @@ def fitted(text: str) -> bytes:
 class StatusTexts:
     """Waiting texts. Call `due` about ten times per second."""
 
-    def __init__(self) -> None:
+    def __init__(self, sufficient: Collection[PoseState] = (PoseState.FULL,)) -> None:
+        """`sufficient`: states in which poses are sent; the others are warnings."""
+        self._sufficient = frozenset(sufficient)
         self._waiting: dict[TextKind, tuple[int, str]] = {}  # severity and text
         self._text_ns: int | None = None
         self._offered: tuple[TextKind, int, str] | None = None  # the newest result of `due`
@@ -73,7 +75,7 @@ class StatusTexts:
     def due(self, now_ns: int) -> list[Any]:
         """The STATUSTEXT to send now, if any."""
         self._queue(now_ns)
-        if not self._waiting or (self._text_ns is not None and 0 <= now_ns - self._text_ns < TEXT_NS):
+        if not self._waiting or (self._text_ns is not None and 0 <= now_ns - self._text_ns < MIN_TEXT_INTERVAL_NS):
             return []
         self._text_ns = now_ns
         kind: TextKind = next(kind for kind in get_args(TextKind) if kind in self._waiting)
@@ -90,12 +92,12 @@ class StatusTexts:
 
     def _queue(self, now_ns: int) -> None:
         sending_ns = self._sending_ns
-        if sending_ns is not None and not self._sending_reported and now_ns - sending_ns >= HOLD_NS:
+        if sending_ns is not None and not self._sending_reported and now_ns - sending_ns >= MIN_STATE_DURATION_NS:
             self._sending_reported = True
             self._waiting["output"] = NOTICE, "sending poses"
         if self._state is None:
             return
         state, reason, since_ns = self._state
-        if state is not self._reported and now_ns - since_ns >= HOLD_NS:
+        if state is not self._reported and now_ns - since_ns >= MIN_STATE_DURATION_NS:
             self._reported = state
-            self._waiting["state"] = SEVERITY.get(state, WARNING), f"{state.name}: {reason}"
+            self._waiting["state"] = INFO if state in self._sufficient else WARNING, f"{state.name}: {reason}"

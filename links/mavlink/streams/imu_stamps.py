@@ -23,7 +23,7 @@ DELAY_NS: dict[str, int] = {"RAW_IMU": 12_500_000, "SCALED_IMU": 12_500_000, "HI
 """Age of the values of an IMU message at its stamp."""
 
 PREFERRED = ("RAW_IMU", "HIGHRES_IMU")
-PREFERRED_NS = 2_000_000_000  # so long after one of them SCALED_IMU is not used
+PREFERENCE_TIMEOUT_NS = 2_000_000_000  # so long after one of them SCALED_IMU is not used
 COUNTER_US = 2**32
 
 
@@ -38,7 +38,7 @@ class ImuSelection:
         if kind in PREFERRED:
             self._preferred_ns = arrival_ns
         elif kind == "SCALED_IMU":
-            return self._preferred_ns is None or arrival_ns - self._preferred_ns > PREFERRED_NS
+            return self._preferred_ns is None or arrival_ns - self._preferred_ns > PREFERENCE_TIMEOUT_NS
         return True
 
 

@@ -2,7 +2,7 @@
 
 One request is under way at a time, because an acknowledgement does not name its message. A request without one is
 repeated; a denied rate is halved, an unsupported message replaced by the next alternative. The requests start again
-after a reboot (time since boot runs backwards) and after silence. The rates that arrive are measured: one that falls
+after a boot of the autopilot and after silence. The rates that arrive are measured: one that falls
 below what was accepted is requested again, and the IMU below 10 Hz is a status with what to do.
 
 What the autopilots do with a request:
@@ -27,17 +27,22 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from links.mavlink.commands import (
+    ACCEPTED,
+    ACK_TIMEOUT_NS,
+    DENIED,
+    IN_PROGRESS,
+    TEMPORARILY_REJECTED,
+    command_long,
+    is_answer,
+)
 from links.mavlink.profiles import ProfileName
-from links.mavlink.transport.framing import dialect
 
 SET_MESSAGE_INTERVAL = 511  # MAV_CMD
-ACCEPTED, TEMPORARILY_REJECTED, DENIED, IN_PROGRESS = 0, 1, 2, 5  # MAV_RESULT; the others: not supported, failed
-REPLY_NS = 1_000_000_000  # a request without acknowledgement is repeated after this time
-RETRY_NS = 10_000_000_000  # between requests for a message that is given up, or whose rate fell
-WINDOW_NS = 2_000_000_000  # in which a rate is measured
+RETRY_PERIOD_NS = 10_000_000_000  # between requests for a message that is given up, or whose rate fell
+RATE_WINDOW_NS = 2_000_000_000  # in which a rate is measured
 NEEDED_IMU_HZ = 10.0  # heading and preintegration work from this rate on
 LOW_SHARE = 0.7  # of the accepted rate: below, it is requested again
-REBOOT_MS = 1000  # time since boot that runs backwards by more: a reboot
 NAMES: dict[str, int] = {
     "SCALED_IMU": 26,
     "RAW_IMU": 27,
@@ -93,7 +98,7 @@ class _Rate:
     def update(self, now_ns: int) -> None:
         """Close windows that have ended."""
         elapsed_ns = now_ns - self.start_ns
-        if elapsed_ns >= WINDOW_NS:
+        if elapsed_ns >= RATE_WINDOW_NS:
             self.hz = self.count * 1e9 / elapsed_ns
             self.start_ns, self.count = now_ns, 0
 
@@ -113,7 +118,6 @@ class MessageIntervals:
         )
         self._counts: Counter[str] = Counter()
         self._rates: dict[str, _Rate] = {}
-        self._boot_ms = 0
         self._imu_names = IMU_MESSAGES[profile] if rates.imu_hz else ()
         self._begin()
 
@@ -133,10 +137,10 @@ class MessageIntervals:
             rate.update(now_ns)
         if self._pending is not None:
             stream, sent_ns = self._pending
-            if now_ns - sent_ns < REPLY_NS:
+            if now_ns - sent_ns < ACK_TIMEOUT_NS:
                 return None
             self._counts["message interval not acknowledged"] += 1
-            stream.answer, stream.next_ns, self._pending = "does not answer", now_ns + REPLY_NS, None
+            stream.answer, stream.next_ns, self._pending = "does not answer", now_ns + ACK_TIMEOUT_NS, None
         for stream in self._streams:
             self._renew(stream, now_ns)
         waiting = [stream for stream in self._streams if not stream.settled and now_ns >= stream.next_ns]
@@ -145,8 +149,7 @@ class MessageIntervals:
         stream = min(waiting, key=lambda stream: stream.next_ns)
         self._pending = stream, now_ns
         self._rates.setdefault(stream.name, _Rate(now_ns))
-        values = float(NAMES[stream.name]), 1e6 / stream.rate_hz, 0.0, 0.0, 0.0, 0.0, 0.0
-        return dialect().MAVLink_command_long_message(*self._target, SET_MESSAGE_INTERVAL, 0, *values)
+        return command_long(self._target, SET_MESSAGE_INTERVAL, float(NAMES[stream.name]), 1e6 / stream.rate_hz)
 
     def on_not_sent(self) -> None:
         """The request of `due` could not be sent."""
@@ -155,20 +158,10 @@ class MessageIntervals:
     def on_message(self, message: Any, now_ns: int) -> None:
         """Take a message of the autopilot."""
         kind = message.get_type()
-        boot_ms = getattr(message, "time_boot_ms", None)
-        if boot_ms is not None:
-            if boot_ms < self._boot_ms - REBOOT_MS:
-                self.restart()
-            self._boot_ms = boot_ms
         if kind in NAMES:
             self._rates.setdefault(kind, _Rate(now_ns)).count += 1
-        elif kind == "COMMAND_ACK" and message.command == SET_MESSAGE_INTERVAL and self._is_ours(message):
+        elif is_answer(message, SET_MESSAGE_INTERVAL, self._own):
             self._on_result(message.result, now_ns)
-
-    def _is_ours(self, ack: Any) -> bool:
-        """Whether an acknowledgement is for us; older autopilots do not name the requester."""
-        named = getattr(ack, "target_system", 0), getattr(ack, "target_component", 0)
-        return all(name in (0, own) for name, own in zip(named, self._own, strict=True))
 
     def _on_result(self, result: int, now_ns: int) -> None:
         if self._pending is None or result == IN_PROGRESS:
@@ -176,10 +169,10 @@ class MessageIntervals:
         (stream, _), self._pending = self._pending, None
         stream.next_ns = now_ns
         if result == ACCEPTED:
-            stream.settled, stream.answer, stream.next_ns = True, "", now_ns + RETRY_NS
+            stream.settled, stream.answer, stream.next_ns = True, "", now_ns + RETRY_PERIOD_NS
             self._rates[stream.name] = _Rate(now_ns)  # the old rate does not count
         elif result == TEMPORARILY_REJECTED:
-            stream.answer, stream.next_ns = "is busy", now_ns + REPLY_NS
+            stream.answer, stream.next_ns = "is busy", now_ns + ACK_TIMEOUT_NS
         elif result == DENIED and stream.rate_hz > NEEDED_IMU_HZ:
             self._counts[f"message interval denied: {stream.name} at {stream.rate_hz:.3g} Hz"] += 1
             stream.denied_hz = stream.denied_hz or stream.rate_hz
@@ -188,7 +181,7 @@ class MessageIntervals:
             stream.name_at += 1
         else:
             self._counts[f"message interval rejected: {stream.name}"] += 1
-            stream.settled, stream.answer, stream.next_ns = True, "rejects it", now_ns + RETRY_NS
+            stream.settled, stream.answer, stream.next_ns = True, "rejects it", now_ns + RETRY_PERIOD_NS
 
     def _renew(self, stream: _Stream, now_ns: int) -> None:
         """Request a message again some time after it was rejected, or when its rate fell."""
@@ -199,7 +192,7 @@ class MessageIntervals:
         if fell and not stream.answer:
             self._counts[f"message interval renewed: {stream.name}"] += 1
         stream.settled = not (fell or stream.answer)
-        stream.next_ns = now_ns if not stream.settled else now_ns + RETRY_NS
+        stream.next_ns = now_ns if not stream.settled else now_ns + RETRY_PERIOD_NS
 
     def imu_rate_hz(self) -> float | None:
         """Rate at which IMU messages arrive; None: not measured yet."""

@@ -65,7 +65,7 @@ class Connection(Protocol):
     reconnects: int
     foreign: int  # datagrams from other senders, ignored
     stalls: int  # how often it was closed because it was blocked
-    left_late: int  # frames that were sent more than LATE_NS late, as far as is known
+    late_frames: int  # frames that were sent more than MAX_LATENCY_NS late, as far as is known
 
     @property
     def status(self) -> str | None:
@@ -94,7 +94,7 @@ class Udp:
     status: str | None = None
 
     def __init__(self, endpoint: Endpoint, sender: IPv4Address | None) -> None:
-        self.reconnects = self.foreign = self.stalls = self.left_late = 0
+        self.reconnects = self.foreign = self.stalls = self.late_frames = 0
         self._only = None if sender is None else str(sender)
         self._peer: Address | None = None
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)

@@ -1,7 +1,9 @@
 """MAVLink framing: split datagrams and byte streams into frames, parse and pack frames.
 
 Each datagram is split on its own, so that damage does not affect the next one. On a byte stream (TCP, serial) the
-splitter resynchronises at the next frame with a correct checksum. Bytes outside frames are counted.
+splitter resynchronises at the next frame with a correct checksum. Bytes outside frames are counted. Each byte of
+garbage may look like the start of a frame, whose checksum takes 20 us: after MAX_DAMAGED of them the rest of the
+received bytes is discarded, so that a sender of garbage cannot occupy the reader.
 
 Source: https://mavlink.io/en/guide/serialization.html (frames, checksum); pymavlink's dialect for the messages.
 """
@@ -17,6 +19,7 @@ SIGNATURE_BYTES = 13
 V1_EXTRA_BYTES, V2_EXTRA_BYTES = 8, 12  # header and checksum
 MIN_FRAME_BYTES, MAX_FRAME_BYTES = 8, 280
 SEQUENCE = 256
+MAX_DAMAGED = 32  # candidate frames with a wrong checksum in one datagram or read
 
 
 @functools.cache
@@ -122,17 +125,22 @@ class FrameSplitter:
 
     def _frames(self, data: bytes | bytearray, whole: bool) -> list[tuple[bytes, Any]]:
         found: list[tuple[bytes, Any]] = []
-        at = 0
+        at = damaged = 0
         while at < len(data):
+            if damaged > MAX_DAMAGED:
+                self.stray_bytes += len(data) - at
+                at = len(data)
+                break
             length = frame_bytes(data, at)
             if length is None or (length and at + length > len(data)):
                 if not whole:
                     break  # the rest of the frame has not arrived
                 length = 0
             frame = bytes(data[at : at + length])
-            message = self._message(frame)
+            message = self._message(frame) if length else None
             if message is None or not (known(message) or _begins(data, at + length)):
                 self.stray_bytes += 1
+                damaged += length > 0
                 at += 1
             else:
                 found.append((frame, message))

@@ -5,7 +5,7 @@ poses as it can transmit, always the newest. A lost line is reopened with increa
 a frame for half a second is blocked; it is closed together with its buffer, so that no old pose arrives as a current
 one. Bytes in the receiver's own buffer cannot be recalled.
 
-Frames that are sent more than LATE_NS late are counted: a slow line that is not blocked transmits late poses.
+Frames that are sent more than MAX_LATENCY_NS late are counted: a slow line that is not blocked transmits late poses.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from ipaddress import IPv4Address
 from typing import Protocol
 
 from flow.link import LinkError
-from links.mavlink.timesync_monitor import LATE_NS
+from links.mavlink.timesync_monitor import MAX_LATENCY_NS
 from links.mavlink.transport.connection import Address, Connection, Endpoint, Udp
 from links.mavlink.transport.framing import MAX_FRAME_BYTES
 from links.mavlink.transport.serial_line import SerialLine
 from links.mavlink.transport.tcp_line import TcpLine
 
-CLOSE_S = 0.1
+MAX_CLOSE_WAIT_S = 0.1
 RETRY_S = (0.1, 2.0)  # first and longest pause before reopening
-STATUS_S = 5.0  # minimum duration of a status: it is polled once per second, and repeated errors are reported once
-STALL_S = 0.5  # ArduPilot treats older messages as half a second old (JitterCorrection), whatever their time stamp
+MIN_STATUS_S = 5.0  # minimum duration of a status: it is polled once per second, and repeated errors are reported once
+MAX_STALL_S = 0.5  # ArduPilot treats older messages as half a second old (JitterCorrection), whatever their time stamp
 
 
 def open_connection(endpoint: Endpoint, sender: IPv4Address | None = None) -> Connection:
@@ -69,9 +69,9 @@ class StreamConnection:
     datagrams = False
 
     def __init__(self, line: Line) -> None:
-        self.reconnects = self.foreign = self.stalls = self.left_late = 0
+        self.reconnects = self.foreign = self.stalls = self.late_frames = 0
         self._line = line
-        self._status, self._status_s = "", -STATUS_S  # the newest error, and its time
+        self._status, self._status_s = "", -MIN_STATUS_S  # the newest error, and its time
         self._up = True
         self._closed = False
         self._reading = threading.Lock()  # held while the line is read, opened or closed
@@ -83,8 +83,8 @@ class StreamConnection:
 
     @property
     def status(self) -> str | None:
-        """The newest error, while the line is down and for STATUS_S after."""
-        expired = self._up and time.monotonic() - self._status_s >= STATUS_S
+        """The newest error, while the line is down and for MIN_STATUS_S after."""
+        expired = self._up and time.monotonic() - self._status_s >= MIN_STATUS_S
         return None if expired or not self._status else self._status
 
     def receive(self, timeout_s: float) -> tuple[bytes, Address] | None:
@@ -119,9 +119,9 @@ class StreamConnection:
             return True
 
     def close(self) -> None:
-        """See Connection. If a reader holds the line for longer than CLOSE_S, the reader closes it."""
+        """See Connection. If a reader holds the line for longer than MAX_CLOSE_WAIT_S, the reader closes it."""
         self._closed, self._up = True, False
-        if self._reading.acquire(timeout=CLOSE_S):
+        if self._reading.acquire(timeout=MAX_CLOSE_WAIT_S):
             self._close_line()
             self._reading.release()
 
@@ -136,10 +136,10 @@ class StreamConnection:
         try:
             if self._is_blocked():
                 self.stalls += 1
-                kbit_per_s = 8e-3 * (self._line.backlog_bytes + MAX_FRAME_BYTES) / STALL_S
+                kbit_per_s = 8e-3 * (self._line.backlog_bytes + MAX_FRAME_BYTES) / MAX_STALL_S
                 self._on_lost(
-                    f"did not transmit within {STALL_S:g} s and was closed with its buffer: is it read at the other "
-                    f"end, and does it carry {kbit_per_s:.0f} kbit/s (otherwise lower clock.rate_hz)?"
+                    f"did not transmit within {MAX_STALL_S:g} s and was closed with its buffer: is it read at the "
+                    f"other end, and does it carry {kbit_per_s:.0f} kbit/s (otherwise lower clock.rate_hz)?"
                 )
                 return b""
             data = self._line.read(timeout_s)
@@ -151,10 +151,10 @@ class StreamConnection:
         return data
 
     def _is_blocked(self) -> bool:
-        """Whether a frame has been buffered for longer than STALL_S. Called by the reader."""
+        """Whether a frame has been buffered for longer than MAX_STALL_S. Called by the reader."""
         with self._writing:
             self._update_in_flight()
-            return bool(self._in_flight) and time.monotonic() - self._in_flight[0][1] > STALL_S
+            return bool(self._in_flight) and time.monotonic() - self._in_flight[0][1] > MAX_STALL_S
 
     def _update_in_flight(self) -> int:
         """Remove transmitted frames and count the late ones. Returns the bytes in the send buffer."""
@@ -162,7 +162,7 @@ class StreamConnection:
         sent_bytes = self._queued_bytes - len(self._rest) - buffered_bytes
         while self._in_flight and self._in_flight[0][0] <= sent_bytes:
             _, start_s = self._in_flight.popleft()
-            self.left_late += time.monotonic() - start_s > 1e-9 * LATE_NS
+            self.late_frames += time.monotonic() - start_s > 1e-9 * MAX_LATENCY_NS
         return buffered_bytes
 
     def _on_lost(self, how: str = "is lost: is it plugged in and powered?") -> None:

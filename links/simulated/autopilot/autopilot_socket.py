@@ -2,7 +2,7 @@
 
 The messages about its flight come from `links.simulated.autopilot.autopilot.Autopilot`, each sent at its time. Without
 a flight it is on the ground and sends HEARTBEAT, and the IMU when it is requested. It replies to TIMESYNC,
-PARAM_REQUEST_READ and requests for its origin and for messages (`requested_intervals.py`), accepts an origin if it has
+PARAM_REQUEST_READ and requests for its origin and for messages (`flight_stack/streams.py`), accepts an origin if it has
 none, and reports its estimator five times a second according to `rules`.
 
     with AutopilotSocket(ArduPilotRules(), send_to=("127.0.0.1", port)) as drone:
@@ -24,8 +24,9 @@ from pymavlink.dialects.v20 import ardupilotmega
 
 from links.mavlink.transport.framing import FrameSplitter, header, packed, parse_frame
 from links.simulated.autopilot.autopilot import STANDARD_GRAVITY_MPS2, Autopilot
+from links.simulated.autopilot.flight_stack.commands import SET_MESSAGE_INTERVAL
+from links.simulated.autopilot.flight_stack.streams import HIGHRES_IMU, RAW_IMU, Streams
 from links.simulated.autopilot.px4_rules import Px4Rules
-from links.simulated.autopilot.requested_intervals import SET_MESSAGE_INTERVAL, RequestedIntervals
 from links.simulated.autopilot.rules import Rules
 from links.simulated.autopilot.udp_thread import UdpThread
 
@@ -37,7 +38,6 @@ REPORT_HZ = 5.0
 PX4_TIMESYNC_HZ = 10.0
 REQUEST_MESSAGE, GPS_GLOBAL_ORIGIN, UNSUPPORTED = 512, 49, 3
 REAL32, INT32 = 9, 6  # MAV_PARAM_TYPE
-RAW_IMU, HIGHRES_IMU = 27, 105  # message ids
 MAX_RECEIVED = 10_000  # received messages that are kept
 
 
@@ -68,8 +68,8 @@ class AutopilotSocket(UdpThread):
         self._begin_ns = scenario_ns()
         self._mav = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=component_id)
         self._own = (system_id, component_id)
-        self._intervals = RequestedIntervals()
         self._px4 = isinstance(rules, Px4Rules)
+        self._streams = Streams("px4" if self._px4 else "ardupilot", {}, ())
         self._peer = send_to
         self._splitter = FrameSplitter()
         self._changed = threading.Condition()
@@ -120,7 +120,8 @@ class AutopilotSocket(UdpThread):
         elif kind == "PARAM_REQUEST_READ" and message.param_id in self.parameters:
             self._send(self._parameter(message.param_id))
         elif kind == "COMMAND_LONG" and message.command == SET_MESSAGE_INTERVAL:
-            self._send(mavlink.MAVLink_command_ack_message(message.command, self._intervals.on_command(message)))
+            result = self._streams.set_interval(round(message.param1), message.param2, message.param3)
+            self._send(mavlink.MAVLink_command_ack_message(message.command, result))
         elif kind == "COMMAND_LONG":
             is_origin_request = message.command == REQUEST_MESSAGE and message.param1 == GPS_GLOBAL_ORIGIN
             self._send(mavlink.MAVLink_command_ack_message(message.command, 0 if is_origin_request else UNSUPPORTED))
@@ -163,7 +164,7 @@ class AutopilotSocket(UdpThread):
 
     def _send_imu_at_rest(self) -> None:
         message_id, now_ns = HIGHRES_IMU if self._px4 else RAW_IMU, self.device_ns()
-        if not (self._intervals.requested(message_id) and self._intervals.passes(message_id, now_ns)):
+        if not (message_id in self._streams.requested and self._streams.passes(message_id, now_ns)):
             return
         if self._px4:
             at_rest = 0.0, 0.0, -STANDARD_GRAVITY_MPS2, *[0.0] * 10, 0b111111
@@ -175,7 +176,7 @@ class AutopilotSocket(UdpThread):
         """Send a message of the flight with a sequence number of this socket, but no reply to the simulated host."""
         message = parse_frame(frame)
         is_reply = message.get_type() == "TIMESYNC" and message.tc1 != 0
-        if not is_reply and self._intervals.passes(message.get_msgId(), self.device_ns()):
+        if not is_reply and self._streams.passes(message.get_msgId(), self.device_ns()):
             self._send(message)
 
     def _due(self, what: str, rate_hz: float) -> bool:

@@ -1,7 +1,6 @@
 """LiDAR pulses: poses of the sensor, sub-rays of a footprint, edges, and the echoes of a pulse.
 
-Source: VLP-16 user manual 63-9243; footprint 3.0 x 1.5 mrad: VLS-128 user manual 63-9483, table F-1, the same family's
-optics.
+Source: VLP-16 user manual 63-9243; aperture: VLS-128 user manual 63-9483, table F-1, the same family's optics.
 """
 
 from __future__ import annotations
@@ -13,7 +12,6 @@ from links.simulated.kernels.ray_casting import Array32
 from stages.geometry.frames import Array64
 from stages.kernels.compiled import compiled
 
-FOOTPRINT_RAD = (3.0e-3, 1.5e-3)  # full width along the scan, across it
 APERTURE_M = (12.7e-3, 9.5e-3)  # size of the beam where it leaves the sensor
 PULSE_LENGTH_M = 1.0  # two surfaces closer than this in range give one blended return
 
@@ -56,14 +54,16 @@ def sub_rays(
     azimuth_rad: Array64,
     elevation_rad: Array64,
     vertical_offset_m: Array64,
+    origin_m: Array64,
     R_world_lidar: Array64,
     t_world_lidar_m: Array64,
     offsets: Array64,
+    footprint_rad: tuple[float, float],
 ) -> tuple[Array32, Array32]:
     """Origins and unit directions (n, k, 3), world frame, of the sub-rays of pulses (n,).
 
-    The axis of a pulse in the lidar frame is (cos w sin a, cos w cos a, sin w), from (0, 0, vertical offset of the
-    laser). `offsets` (k, 2) are in half footprints, along and across the scan.
+    The axis of a pulse in the lidar frame is (cos w sin a, cos w cos a, sin w), from (x, y, vertical offset of the
+    laser) with origin_m (n, 2). `offsets` (k, 2) are in half footprints, along and across the scan.
     """
     count, rays = len(azimuth_rad), len(offsets)
     origins = np.empty((count, rays, 3), dtype=np.float32)
@@ -75,15 +75,15 @@ def sub_rays(
         R = R_world_lidar[i]
         for k in range(rays):
             u, v = offsets[k]
-            turn, lift = u * FOOTPRINT_RAD[0] / 2, v * FOOTPRINT_RAD[1] / 2
+            turn, lift = u * footprint_rad[0] / 2, v * footprint_rad[1] / 2
             across, up = u * APERTURE_M[0] / 2, v * APERTURE_M[1] / 2
             # axis + turn * e_across + lift * e_up, with e_across = (ca, -sa, 0) and e_up = (-sw sa, -sw ca, cw)
             ray[0] = cw * sa + turn * ca - lift * sw * sa
             ray[1] = cw * ca - turn * sa - lift * sw * ca
             ray[2] = sw + lift * cw
             ray /= np.sqrt(ray[0] ** 2 + ray[1] ** 2 + ray[2] ** 2)
-            start[0] = across * ca - up * sw * sa
-            start[1] = -across * sa - up * sw * ca
+            start[0] = origin_m[i, 0] + (across * ca - up * sw * sa)
+            start[1] = origin_m[i, 1] + (-across * sa - up * sw * ca)
             start[2] = vertical_offset_m[i] + up * cw
             for j in range(3):
                 directions[i, k, j] = R[j, 0] * ray[0] + R[j, 1] * ray[1] + R[j, 2] * ray[2]

@@ -31,6 +31,7 @@ from links.simulated.world.procedural import SceneSettings
 from links.simulated.world.procedural.settings import Kind
 from links.simulated.world.weather import Weather
 from stages.calibration.calibrate import ZERO_SIGMA_DEG
+from stages.geometry.lidar_models import LidarModel
 
 RANGES_M = (10, 20, 30, 45, 60)
 MOTIONS = ("hover", "orbit", "cross", "fast", "overhead", "climb")
@@ -67,6 +68,7 @@ class Conditions:
     cameras_hz: float | None = None  # rate of two fisheyes; None: no cameras
     cameras_px: int = 720  # size of their square images
     readout_ms: float = 0.0  # of their rolling shutter, first to last row; 0: global shutter
+    lidar: LidarModel = "VLP-16"
     perturbed: bool = False  # the rig differs from its file, and the kind of drone varies between flights
     sparse: bool = False  # fewer rays per pulse: half the time
     varied_sky: bool = False  # movers of `links/simulated/world/sky_movers.py`
@@ -120,7 +122,7 @@ def scenario_of(cell: Cell, seed: int, conditions: Conditions | None = None) -> 
     appearance = {"model": DRONE} if perturbed is None else {"model": perturbed.model, "span_m": perturbed.span_m}
     drones = tuple(DroneSettings.model_validate({"path": path} | appearance) for path in paths)
     what = f"{cell.motion} at {cell.range_m} m" if drones else "no drone"
-    nominal = RigLidar()
+    nominal = RigLidar.model_validate({"model": conditions.lidar})
     found = {
         "servo_harmonics": GearTrain(SERVO, seed).harmonics(),
         "servo_play_deg": SERVO.backlash_deg,
@@ -151,7 +153,7 @@ def scenario_of(cell: Cell, seed: int, conditions: Conditions | None = None) -> 
         cameras=_cameras(conditions, bool(drones), perturbed),
         weather=RAIN if conditions.rain else Weather(),
         vehicle_odometry=VehicleOdometrySettings() if conditions.odometry else None,
-        rig=RigLidar(mount=calibrated) if conditions.calibrated else nominal,
+        rig=nominal.model_copy(update={"mount": calibrated}) if conditions.calibrated else nominal,
         true_mount=true_mount,
     )
 

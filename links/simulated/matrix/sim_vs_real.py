@@ -21,23 +21,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flow.link import Record
+from links.lidar import Lidar as Decoder
 from links.recording import RecordingReader
 from links.simulated.kernels.lidar import echoes
 from links.simulated.kernels.ray_casting import Array32
 from links.simulated.sensors.lidar import FINE, Lidar, LidarSettings, sub_rays
-from links.simulated.sensors.vlp16_packets import FIRINGS_PER_BLOCK, encode_packet, firings_per_packet
+from links.simulated.sensors.lidar_packets import PacketEncoder
 from links.simulated.world.drone import DroneModel, drone_mesh
 from links.simulated.world.mesh import Mesh, RayScene
 from links.simulated.world.procedural.indoor import indoor_mesh
-from links.velodyne import Lidar as Decoder
-from links.velodyne import vlp16
 from stages.geometry.frames import Array64
+from stages.geometry.lidar_models import lidar_profile
+from stages.geometry.rig_lidar import RigLidar
 from stages.messages import LidarFirings
 
 START_NS = 1_748_773_230_000_000_000
 WINDOW = 15  # firings of one laser, 3 deg: within it the range of a wall is a parabola
 FLAT_M = 0.03  # largest residual of a flat patch
-UPPER_LASERS = np.arange(1, vlp16.LASERS, 2)  # at +1 deg and above: clear of table and vehicle
+LASERS = lidar_profile("VLP-16").lasers
+UPPER_LASERS = np.arange(1, LASERS, 2)  # at +1 deg and above: clear of table and vehicle
 MID360_PULSES = 20_000  # per frame of 0.1 s
 MID360_VIEW_SR = 2 * np.pi * (np.sin(np.radians(52)) - np.sin(np.radians(-7)))
 NEAR_DRONE_M = 0.6
@@ -65,11 +67,11 @@ def measure(firings: Iterable[LidarFirings]) -> CloudFigures:
     """Figures of a capture in strongest mode."""
     packets = list(firings)
     ranges, azimuth = (
-        np.concatenate([getattr(p, name) for p in packets]).astype(np.float64).reshape(-1, vlp16.LASERS)
+        np.concatenate([getattr(p, name) for p in packets]).astype(np.float64).reshape(-1, LASERS)
         for name in ("range_m", "azimuth_rad")
     )
-    shade = np.concatenate([p.reflectivity for p in packets]).reshape(-1, vlp16.LASERS)
-    points = np.concatenate([p.xyz_lidar_m for p in packets]).reshape(-1, vlp16.LASERS, 3).astype(np.float64)
+    shade = np.concatenate([p.reflectivity for p in packets]).reshape(-1, LASERS)
+    points = np.concatenate([p.xyz_lidar_m for p in packets]).reshape(-1, LASERS, 3).astype(np.float64)
     turns = float(np.ptp(np.unwrap(azimuth[:, 0]))) / (2 * np.pi)
     returned = ranges > 0
     before, here, after = ranges[:-2], ranges[1:-1], ranges[2:]
@@ -98,7 +100,7 @@ def _patch_residuals(ranges: Array64) -> Array64:
     """Residual (p,) of a parabola through each full, flat window of one laser, with its degrees of freedom."""
     t = np.linspace(-1, 1, WINDOW)
     basis = np.linalg.qr(np.column_stack([np.ones(WINDOW), t, t**2]))[0]
-    whole = ranges[: len(ranges) // WINDOW * WINDOW].reshape(-1, WINDOW, vlp16.LASERS).transpose(0, 2, 1)
+    whole = ranges[: len(ranges) // WINDOW * WINDOW].reshape(-1, WINDOW, LASERS).transpose(0, 2, 1)
     windows = whole.reshape(-1, WINDOW)
     windows = windows[(windows > 0).all(axis=1) & (np.ptp(windows, axis=1) < 0.3)]
     left = windows - windows @ basis @ basis.T
@@ -108,7 +110,7 @@ def _patch_residuals(ranges: Array64) -> Array64:
 
 def _laser_bias_m(points: Array64, returned: NDArray[np.bool_]) -> float:
     """Spread over the lasers of their mean distance from planes through patches of 2 windows and all lasers."""
-    offsets: list[list[float]] = [[] for _ in range(vlp16.LASERS)]
+    offsets: list[list[float]] = [[] for _ in range(LASERS)]
     size = 2 * WINDOW
     for first in range(0, len(points) - size, size):
         patch, there = points[first : first + size], returned[first : first + size]
@@ -164,18 +166,16 @@ def simulated_indoor_scene(turns: float, seed: int = 1) -> Iterator[LidarFirings
         StaticScene(indoor_mesh(1.0, seed)),
         Decoder(),
     )
-    firings = firings_per_packet("strongest")
-    for packet in range(int(turns * 1e8 / (firings * vlp16.SEQUENCE_NS))):
-        first_ns = START_NS + packet * firings * vlp16.SEQUENCE_NS
-        sequence_ns = first_ns + vlp16.SEQUENCE_NS * np.arange(firings, dtype=np.int64)
-        pulse_ns = (sequence_ns[:, None] + vlp16.PULSE_NS * np.arange(vlp16.LASERS)).ravel()
+    encoder = PacketEncoder(RigLidar(), "strongest")
+    for packet in range(int(turns * 1e8 / encoder.packet_ns)):
+        first_ns = START_NS + packet * encoder.packet_ns
+        sequence_ns = first_ns + encoder.sequence_offsets_ns(1)
+        pulse_ns = (sequence_ns[:, None] + np.array(encoder.profile.firing_ns)).ravel()
         level = np.broadcast_to(np.eye(3), (len(pulse_ns), 3, 3)).copy()
         pulses = lidar.fire(pulse_ns, level, np.zeros((len(pulse_ns), 3)), environment)
-        shape = (1, firings, vlp16.LASERS)
-        azimuth = lidar.azimuth_rad(sequence_ns[::FIRINGS_PER_BLOCK])
-        data = encode_packet(
-            first_ns, azimuth, pulses.range_m.reshape(shape), pulses.reflectivity.reshape(shape), "strongest"
-        )
+        shape = (1, encoder.sequences, LASERS)
+        ranges, shades = pulses.range_m.reshape(shape), pulses.reflectivity.reshape(shape)
+        data = encoder.encode(first_ns, lidar.azimuth_rad(sequence_ns), ranges, shades)
         record = Record("/lidar/packets", arrival_ns=first_ns + 2_000_000, stamp_ns=first_ns, data=data)
         decoded = decoder.decode(record)
         if decoded is not None:
@@ -206,10 +206,10 @@ def drone_area_m2(mesh: Mesh, from_m: Array64, step_rad: float = 4e-3) -> float:
     origins, directions = sub_rays(np.zeros(len(axis)), laser, aim @ tilt, origin, FINE.offsets)
     shape = directions.shape[:2]
     ranges, fractions = RayScene(mesh).cast(origins.reshape(-1, 3), directions.reshape(-1, 3), 200.0)
-    settings = LidarSettings()
-    threshold = np.full(len(axis), 0.10 / settings.range_at_10_percent_m**2)
+    profile = lidar_profile("VLP-16")
+    threshold = np.full(len(axis), 0.10 / profile.range_at_10_percent_m**2)
     returned = (ranges.reshape(shape), fractions.reshape(shape), np.zeros(shape, dtype=np.uint8))
-    found = echoes(*returned, FINE.shares, threshold, settings.min_range_m, "strongest")[0][0] > 0
+    found = echoes(*returned, FINE.shares, threshold, profile.min_range_m, "strongest")[0][0] > 0
     return float(found.sum()) * step_rad**2 * range_m**2
 
 

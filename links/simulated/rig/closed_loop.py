@@ -14,7 +14,8 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from pathlib import Path
+from pathlib import Path as FilePath
+from tempfile import TemporaryDirectory
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field
@@ -27,10 +28,10 @@ from flow.replay import Replay, RunReport
 from flow.taps import Digest
 from links.dynamixel import Servo
 from links.dynamixel.servo import NOT_LIVE, GoalCommand
+from links.lidar import Lidar
 from links.runs.request import RunRequest
 from links.simulated.rig.pose_loop import PoseLoop, PoseTap, has_autopilot
 from links.simulated.sensors.servo import STEP_NS
-from links.velodyne import Lidar
 from stages.messages import ServoGoal
 
 LONGEST_BATCH_NS = 40_000_000  # longer batches are not faster
@@ -76,6 +77,7 @@ class ClosedLoop:
         self._compute_ns = round(settings.compute_s * 1e9)
         self._start_ns: int | None = None
         self._running = True
+        self._folder = TemporaryDirectory(prefix="grd-") if settings.killed_s is not None else None
         self._start()
 
     def _start(self) -> None:
@@ -90,7 +92,9 @@ class ClosedLoop:
             self._servo = servo
             goals.watch(output, servo)
         connected = self._start_ns is not None and has_autopilot(graph)
-        self._poses = PoseLoop(self._replay, graph, poses, self._compute_ns) if connected else None
+        self._pose_tap = poses
+        state_file = None if self._folder is None else FilePath(self._folder.name) / "sent.json"
+        self._poses = PoseLoop(self._replay, graph, poses, self._compute_ns, state_file) if connected else None
 
     def connect_autopilot(self, start_ns: int) -> None:
         """The autopilot of a scenario that starts at a time flies on what the graph sends: open its session."""
@@ -114,6 +118,12 @@ class ClosedLoop:
             self._start()
         self._running = running
         return running
+
+    @property
+    def heading_s(self) -> float | None:
+        """Time from the first position to the first pose with a rotation, since the last start; None: not yet."""
+        first_ns = self._pose_tap.first_ns
+        return (first_ns[True] - min(first_ns.values())) * 1e-9 if True in first_ns else None
 
     def sent(self) -> list[Record]:
         """Frames to the autopilot since the last call, stamped with the time at which they leave the host."""
@@ -164,7 +174,7 @@ def servo_edge(graph: Graph) -> tuple[str, str]:
     return found[0]
 
 
-def loop_metadata(config: Path, graph: Graph) -> dict[str, str]:
+def loop_metadata(config: FilePath, graph: Graph) -> dict[str, str]:
     """Metadata of a recording made in closed loop: name of the configuration and hash of its content.
 
     The hash includes included files and the rig, but not the taps, which change no message.
@@ -178,7 +188,9 @@ def loop_metadata(config: Path, graph: Graph) -> dict[str, str]:
     }
 
 
-def load_loop(config: Path, rig_yaml: str, scenario: str, settings: ClosedLoopSettings) -> ClosedLoop:
+def load_loop(
+    config: FilePath, rig_yaml: str, scenario: str, settings: ClosedLoopSettings, taps: Sequence[Tap] = ()
+) -> ClosedLoop:
     """A configuration as a closed loop on the rig of a scenario. ConfigError has all problems of the configuration."""
     graph = RunRequest(config).graph(rig_yaml, scenario)
-    return ClosedLoop(graph, settings, loop_metadata(config, graph))
+    return ClosedLoop(graph, settings, loop_metadata(config, graph), taps)

@@ -12,19 +12,19 @@ from links.simulated.autopilot.flight_stack.outcome import FlightOutcome, Outcom
 from links.simulated.autopilot.flight_stack.stack import FlightStack
 from links.simulated.rig.closed_loop import ClosedLoop
 from links.simulated.rig.scenario import Scenario
+from links.simulated.sensors.vehicle_odometry import VehicleOdometry
 from links.simulated.world.clearance import visible
 from links.simulated.world.mesh import RayScene
 from links.simulated.world.scene import Truth
 
 OUTCOME_TOPIC = f"{TRUTH_TOPICS}/flight"
 ABOVE_M = 50.0  # over the place of a take-off, must be free
-ODOMETRY_TOPIC = "/vehicle/odometry"
 
 
 class FlightInTheLoop:
     """One flight. Without a `loop` the autopilot receives nothing."""
 
-    def __init__(self, scenario: Scenario, loop: ClosedLoop | None) -> None:
+    def __init__(self, scenario: Scenario, loop: ClosedLoop | None, odometry: VehicleOdometry | None) -> None:
         assert scenario.drone is not None
         assert scenario.autopilot is not None
         self.stack = FlightStack(
@@ -35,8 +35,9 @@ class FlightInTheLoop:
             scenario.start_ns,
             scenario.duration_s,
             scenario.seed,
+            odometry.drift_m if odometry is not None else None,
         )
-        self._loop = loop
+        self._loop, self._odometry = loop, odometry
         self._outcome: FlightOutcome | None = None
         if loop is not None:
             loop.connect_autopilot(scenario.start_ns)
@@ -47,7 +48,7 @@ class FlightInTheLoop:
         if self.stack.settings.on_ground and not visible(world, start_m, start_m + np.array([0.0, 0.0, ABOVE_M]))[0]:
             x, y, _ = start_m[0]
             raise LinkError(f"drone.path: something stands where it takes off, ({x:.1f}, {y:.1f}) m: move its start")
-        self._outcome = FlightOutcome(self.stack, world, truth)
+        self._outcome = FlightOutcome(self.stack, world, truth, self._odometry)
 
     def is_over(self) -> bool:
         """Whether the flight was lost some time ago; called after each part of it."""
@@ -55,8 +56,6 @@ class FlightInTheLoop:
 
     def arrived(self, record: Record) -> Record | None:
         """A record as the host receives it; None: it does not (the host is down, or rejects the frame)."""
-        if self._outcome is not None and record.topic == ODOMETRY_TOPIC:
-            self._outcome.on_odometry(record)
         if self._loop is None or record.topic.startswith(TRUTH_TOPICS):
             return record
         return self._loop.receive(record)
@@ -65,6 +64,8 @@ class FlightInTheLoop:
         """Frames that the host has sent since the last call; they go to the autopilot."""
         frames = [] if self._loop is None else self._loop.sent()
         for frame in frames:
+            if frame.stamp_ns != frame.arrival_ns:
+                continue  # of an earlier run: recorded again, not sent
             self.stack.receive(frame.data, frame.arrival_ns)
             if self._outcome is not None:
                 self._outcome.on_sent(frame)
@@ -72,7 +73,8 @@ class FlightInTheLoop:
 
     def result(self) -> Outcome | None:
         """The outcome."""
-        return None if self._outcome is None else self._outcome.result()
+        heading_s = None if self._loop is None else self._loop.heading_s
+        return None if self._outcome is None else self._outcome.result(heading_s)
 
     def record(self, at_ns: int) -> Record | None:
         """The outcome as a record."""

@@ -21,10 +21,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from flow.config.yaml_text import YamlTextError, yaml_values
 from flow.link import LinkError, Record
 from links.recording import CompressedImage, RecordingReader, decode_compressed_image, encode_compressed_image
 from links.simulated.rig.scenario import Scenario
@@ -244,6 +244,6 @@ def _scenario_of(reader: RecordingReader) -> Scenario:
     if not reader.finished:
         raise LinkError(f"{reader.path} is incomplete: {OTHER_FLIGHT}")
     try:
-        return Scenario.model_validate(yaml.safe_load(reader.config_yaml))
-    except (yaml.YAMLError, ValidationError):
+        return Scenario.model_validate(yaml_values(reader.config_yaml))
+    except (YamlTextError, ValidationError):
         raise LinkError(f"{reader.path}: its scenario does not fit this version of grd: {OTHER_FLIGHT}") from None

@@ -42,9 +42,8 @@ from links.simulated.rig.run import Simulation
 from links.simulated.rig.scenario import Scenario, load_scenario
 from links.simulated.sensors.camera import CamerasSettings
 from links.simulated.sensors.dynamixel_emulator import DynamixelEmulator
+from links.simulated.sensors.lidar_packets import encode_position
 from links.simulated.sensors.vehicle_odometry import VehicleOdometry
-from links.simulated.sensors.vlp16_packets import encode_position, firings_per_packet
-from links.velodyne import vlp16
 from stages.geometry.frames import Array64
 
 WARM_PACKETS = 75  # one revolution of the rotor
@@ -62,7 +61,7 @@ class LiveSimulation(Simulation):
     def __init__(self, scenario: Scenario, images: ImageCache | None = None) -> None:
         super().__init__(scenario, images=images)
         self.flight_socket: FlightSocket | None = None
-        self.packet_ns = firings_per_packet(scenario.lidar.return_mode) * vlp16.SEQUENCE_NS
+        self.packet_ns = self.encoder.packet_ns
         self.ahead_ns = 0
         self.emulator: DynamixelEmulator | None = None
         if self.flight is not None:

@@ -24,6 +24,7 @@ from pydantic import Field
 from flow.link import LinkError, Run, Tap
 from flow.message import Message
 from flow.stage import Settings
+from links.runs.shipped import shipped
 
 START_S = 120.0  # limit for building the world and, once, compiling
 END_S = 1.0
@@ -76,14 +77,17 @@ class LiveRig(Tap[LiveRigSettings]):
         if not run.live:
             return
         settings = self.settings
-        if not settings.scenario.is_file():
+        scenario = shipped(settings.scenario)
+        if not scenario.is_file():
             raise LinkError(f"{settings.scenario}: no such scenario; the path is relative to {Path.cwd()}")
         if settings.images is not None and not settings.images.is_file():
             raise LinkError(
                 f"{settings.images}: no such recording, and fisheyes cannot be rendered in real time. Render them "
                 f"once, in some minutes: grd simulate {settings.scenario} -o {settings.images}"
             )
-        arguments = json.dumps({**settings.model_dump(mode="json"), "folder": str(run.out_dir)})
+        arguments = json.dumps(
+            {**settings.model_dump(mode="json"), "scenario": str(scenario), "folder": str(run.out_dir)}
+        )
         command = [sys.executable, "-m", "links.simulated.rig.live_process", arguments]
         self._process = subprocess.Popen(
             command,

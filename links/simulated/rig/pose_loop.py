@@ -9,6 +9,8 @@ Source: ours.
 
 from __future__ import annotations
 
+from pathlib import Path as FilePath
+
 from flow.graph import Graph
 from flow.link import Record, Tap
 from flow.message import Message
@@ -28,7 +30,7 @@ class VirtualConnection:
     status: str | None = None
 
     def __init__(self) -> None:
-        self.reconnects = self.foreign = self.stalls = self.left_late = 0
+        self.reconnects = self.foreign = self.stalls = self.late_frames = 0
         self._open = False
 
     def receive(self, timeout_s: float) -> tuple[bytes, tuple[str, int]] | None:
@@ -53,6 +55,8 @@ class PoseTap(Tap):
 
     def __init__(self) -> None:
         super().__init__()
+        self.first_ns: dict[bool, int] = {}
+        """Arrival of the first pose without and with a rotation."""
         self._output: str | None = None
         self._link: Autopilot | None = None
 
@@ -67,13 +71,18 @@ class PoseTap(Tap):
     def see(self, output: str, message: Message, arrival_ns: int) -> None:
         """Pass on a pose."""
         if self._link is not None and output == self._output and isinstance(message, RelativePose):
+            if message.estimate is not None:
+                self.first_ns.setdefault(message.R_vehicle_drone is not None, arrival_ns)
             self._link.on_pose(message)
 
 
 class PoseLoop:
     """The session of a graph's Autopilot link in virtual time."""
 
-    def __init__(self, replay: Replay, graph: Graph, tap: PoseTap, compute_ns: int) -> None:
+    def __init__(
+        self, replay: Replay, graph: Graph, tap: PoseTap, compute_ns: int, state_file: FilePath | None = None
+    ) -> None:
+        """`state_file`: where runs that follow each other keep what was sent, unless the link has such a file."""
         self._now_ns = 0
         self._compute_ns = compute_ns
         self._next_tick_ns: int | None = None
@@ -81,6 +90,8 @@ class PoseLoop:
         link = replay.nodes[name]
         assert isinstance(link, Autopilot)
         self._link, self._topic = link, link.topic
+        if state_file is not None and link.settings.state_file is None:
+            link.settings = link.settings.model_copy(update={"state_file": state_file})
         if output is not None:
             tap.watch(output, link)
 

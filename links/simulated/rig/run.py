@@ -16,13 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flow.link import TRUTH_TOPICS, LinkError, Record
+from links.lidar import packet_format
 from links.recording import RecordingWriter
 from links.simulated.autopilot.autopilot import Autopilot
 from links.simulated.autopilot.flight_stack.outcome import Outcome
 from links.simulated.autopilot.flight_stack.stack import FlightStack
 from links.simulated.kernels.lidar import lidar_poses
+from links.simulated.pose_sensors.fix_sensor import FixSensor
+from links.simulated.pose_sensors.rotation_sensor import RotationSensor
 from links.simulated.rig.closed_loop import ClosedLoop, load_loop
-from links.simulated.rig.fix_sensor import FixSensor
 from links.simulated.rig.flight_in_the_loop import FlightInTheLoop
 from links.simulated.rig.image_cache import CachedCamera, ImageCache, scenario_world
 from links.simulated.rig.scenario import Scenario, load_scenario
@@ -31,9 +33,9 @@ from links.simulated.rig.truth_records import TruthRecords
 from links.simulated.sensors.camera import Camera, build_cameras
 from links.simulated.sensors.camera_paint import Street
 from links.simulated.sensors.lidar import Lidar
+from links.simulated.sensors.lidar_packets import PacketEncoder
 from links.simulated.sensors.servo import ServoBus
 from links.simulated.sensors.vehicle_odometry import VehicleOdometry
-from links.simulated.sensors.vlp16_packets import FIRINGS_PER_BLOCK, encode_packet, firings_per_packet
 from links.simulated.world.clearance import check_paths
 from links.simulated.world.flight import Flight
 from links.simulated.world.flown_motion import FlownMotion
@@ -41,7 +43,6 @@ from links.simulated.world.path import Path
 from links.simulated.world.scene import Scene, Truth, drone_shapes
 from links.simulated.world.suspension import SuspendedPath
 from links.simulated.world.vehicle import vehicle_mesh, vehicle_mesh_from_camera
-from links.velodyne import vlp16
 from stages.geometry.frames import Array64
 
 BATCH_PACKETS = 32  # pulses are cast in batches; their size changes no byte
@@ -80,32 +81,36 @@ class Simulation:
         seed: int | None = None,
         loop: ClosedLoop | None = None,
         images: ImageCache | None = None,
+        *,
+        record_truth: bool = True,
     ) -> None:
         """With a `loop` its pipeline commands the servo, and the scenario's script is not used.
 
         With `images`, a recording of the same flight, the cameras are not rendered.
         """
-        self._loop = loop
+        self._loop, self._record_truth = loop, record_truth
         self.scenario = scenario if seed is None else scenario.changed(seed=seed)
         self.seed = self.scenario.seed
         drone = scenario.drone
         start_ns, duration_s = scenario.start_ns, scenario.duration_s
         drone_motion: Path | Flight | FlownMotion | None = drone.path if drone else None
-        self.telemetry_sources: list[Autopilot | FlightStack | VehicleOdometry] = []
+        self.telemetry_sources: list[Autopilot | FlightStack | VehicleOdometry | RotationSensor] = []
         self.flight: FlightInTheLoop | None = None
+        vehicle = scenario.vehicle
+        vehicle_motion: Path | SuspendedPath = vehicle.path
+        if vehicle.suspension is not None:
+            vehicle_motion = SuspendedPath(vehicle.path, vehicle.suspension, duration_s, self.seed)
+        odometry: VehicleOdometry | None = None
+        if scenario.vehicle_odometry is not None:
+            odometry = VehicleOdometry(scenario.vehicle_odometry, vehicle_motion, start_ns, duration_s, self.seed)
         if drone is not None and scenario.autopilot is not None and scenario.autopilot.flight_stack is not None:
-            self.flight = FlightInTheLoop(self.scenario, loop)
+            self.flight = FlightInTheLoop(self.scenario, loop, odometry)
             drone_motion = self.flight.stack.motion
             self.telemetry_sources.append(self.flight.stack)
         elif drone is not None and scenario.autopilot is not None:
             drone_motion = Flight(drone.path, scenario.autopilot.flight, duration_s, self.seed)
             self.telemetry_sources.append(Autopilot(scenario.autopilot, drone_motion, start_ns, duration_s, self.seed))
-        vehicle = scenario.vehicle
-        vehicle_motion: Path | SuspendedPath = vehicle.path
-        if vehicle.suspension is not None:
-            vehicle_motion = SuspendedPath(vehicle.path, vehicle.suspension, duration_s, self.seed)
-        if scenario.vehicle_odometry is not None:
-            odometry = VehicleOdometry(scenario.vehicle_odometry, vehicle_motion, start_ns, duration_s, self.seed)
+        if odometry is not None:
             self.telemetry_sources.append(odometry)
         others = scenario.other_drones
         self.truth = Truth(start_ns, vehicle_motion, drone_motion, tuple(other.path for other in others))
@@ -127,7 +132,12 @@ class Simulation:
             self.flight.watch(self._scene.world, self.truth)
         fixes = scenario.fix_sensor
         self._fixes = None if fixes is None else FixSensor(fixes, self.truth, scenario.lidar_gaps_s, self.seed)
-        self._lidar = Lidar(scenario.lidar, scenario.start_ns, self.seed, scenario.weather)
+        if scenario.rotation_sensor is not None:
+            self.telemetry_sources.append(RotationSensor(scenario.rotation_sensor, self.truth, self.seed))
+        unit = scenario.rig
+        form = packet_format(unit.model, unit.beams)
+        self._lidar = Lidar(scenario.lidar, scenario.start_ns, self.seed, scenario.weather, form)
+        self.encoder = PacketEncoder(unit, scenario.lidar.return_mode)
         script = scenario.script if loop is None else ()
         commander = ServoScript(script, self.drone_servo_rad if drone else None, self.seed)
         shift_ns = round(scenario.mount.servo_time_offset_s * 1e9)
@@ -162,7 +172,7 @@ class Simulation:
         sent = 0
         start_ns = self.scenario.start_ns
         end_ns = start_ns + round(self.scenario.duration_s * 1e9)
-        packet_ns = firings_per_packet(self.scenario.lidar.return_mode) * vlp16.SEQUENCE_NS
+        packet_ns = self.encoder.packet_ns
         first_ns = start_ns
         most = BATCH_PACKETS if self._loop is None else max(1, self._loop.longest_batch_ns() // packet_ns)
         while first_ns < end_ns:
@@ -201,7 +211,7 @@ class Simulation:
             records += camera.records(next_ns)
         for source in self.telemetry_sources:
             records += source.records(next_ns)
-        return records + self.truth_records(next_ns)
+        return records + (self.truth_records(next_ns) if self._record_truth else [])
 
     def _push(self, records: list[Record]) -> None:
         """Keep records until they arrive, except LiDAR packets in a gap."""
@@ -250,23 +260,22 @@ class Simulation:
 
     def lidar_records(self, first_ns: int, packets: int, packet_ns: int) -> list[Record]:
         """LiDAR packets from a time on, in order of time, and the records of pulses that drones returned."""
-        firings = firings_per_packet(self.scenario.lidar.return_mode)
-        sequence_ns = first_ns + vlp16.SEQUENCE_NS * np.arange(packets * firings, dtype=np.int64)
-        pulse_ns = (sequence_ns[:, None] + vlp16.PULSE_NS * np.arange(vlp16.LASERS)).ravel()
+        profile, sequences = self.encoder.profile, self.encoder.sequences
+        sequence_ns = first_ns + self.encoder.sequence_offsets_ns(packets)
+        pulse_ns = (sequence_ns[:, None] + np.array(profile.firing_ns)).ravel()
         pulses = self._lidar.fire(pulse_ns, *self.T_world_lidar(pulse_ns), self._scene)
         self.pulses += len(pulse_ns)
         self.returns += int(np.count_nonzero(pulses.range_m))
         self.drone_return_ns += pulse_ns[(pulses.drone_share > 0.5).any(axis=0)].tolist()
-        azimuth = self._lidar.azimuth_rad(sequence_ns[::FIRINGS_PER_BLOCK]).reshape(packets, -1)
-        ranges = pulses.range_m.reshape(-1, packets, firings, vlp16.LASERS)
+        azimuth = self._lidar.azimuth_rad(sequence_ns).reshape(packets, -1)
+        ranges = pulses.range_m.reshape(-1, packets, sequences, profile.lasers)
         shades = pulses.reflectivity.reshape(ranges.shape)
         jitter_ns = self._arrival.uniform(3e5, 8e5, packets).astype(np.int64)
         last_pulse_ns = pulse_ns.reshape(packets, -1)[:, -1]
         records: list[Record] = []
         for i in range(packets):
             at = first_ns + i * packet_ns
-            mode = self.scenario.lidar.return_mode
-            data = encode_packet(at + self.lidar_clock_ns, azimuth[i], ranges[:, i], shades[:, i], mode)
+            data = self.encoder.encode(at + self.lidar_clock_ns, azimuth[i], ranges[:, i], shades[:, i])
             arrival_ns = int(last_pulse_ns[i] + jitter_ns[i])
             records.append(Record("/lidar/packets", arrival_ns=arrival_ns, stamp_ns=at // 1000 * 1000, data=data))
         return records + self._truth_records.hits(pulse_ns.reshape(packets, -1), pulses)
@@ -286,14 +295,18 @@ def simulate(
     closed_loop: FilePath | None = None,
     duration_s: float | None = None,
     images: FilePath | None = None,
+    sets: Sequence[str] = (),
 ) -> SimulationReport:
     """Simulate a scenario file into a recording, in closed loop if a configuration is given.
 
-    `images` is a recording of the same flight whose images are used; the result is the same to the byte. `progress`
-    gets the completed fraction, 0 to 1. Errors are LinkError, and ConfigError for the configuration.
+    `sets` change settings of the scenario (`autopilot.imu_hz=25`). `images` is a recording of the same flight whose
+    images are used; the result is the same to the byte. `progress` gets the completed fraction, 0 to 1. Errors are
+    LinkError, and ConfigError for the configuration.
     """
-    overrides = {"seed": seed, "duration_s": duration_s}
-    loaded = load_scenario(scenario).changed(**{name: value for name, value in overrides.items() if value is not None})
+    given = {"seed": seed, "duration_s": duration_s}
+    loaded = load_scenario(scenario, sets).changed(
+        **{name: value for name, value in given.items() if value is not None}
+    )
     loop = None
     if closed_loop is not None:
         loop = load_loop(closed_loop, loaded.rig_yaml(), f"{loaded.name} (rig)", loaded.closed_loop)

@@ -6,6 +6,7 @@ Source: ours.
 from __future__ import annotations
 
 import datetime
+from collections.abc import Sequence
 from pathlib import Path as FilePath
 from typing import Any, Literal, Self
 
@@ -16,8 +17,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from flow.config.tree import load_tree, resolve
 from flow.config_error import ConfigError, did_you_mean
 from links.simulated.autopilot.autopilot import AutopilotSettings
+from links.simulated.pose_sensors.fix_sensor import FixSensorSettings
+from links.simulated.pose_sensors.rotation_sensor import RotationSensorSettings
 from links.simulated.rig.closed_loop import ClosedLoopSettings
-from links.simulated.rig.fix_sensor import FixSensorSettings
 from links.simulated.rig.scripted_servo import Segment, VibrateSegment
 from links.simulated.sensors.camera import CamerasSettings, rig_cameras
 from links.simulated.sensors.lidar import LidarSettings
@@ -29,11 +31,14 @@ from links.simulated.world.procedural import SceneSettings
 from links.simulated.world.suspension import SuspensionSettings
 from links.simulated.world.vehicle import vehicle_mesh_from_camera
 from links.simulated.world.weather import Weather
+from stages.geometry import rig_lidar
 from stages.geometry.frames import Array64, LidarMount, Pose
+from stages.geometry.lidar_models import LIDAR_MODELS, lidar_profile
 
 CLEARANCE_M = 0.3  # minimum height of a drone above the road
 WHEELS_M = 0.15  # maximum height of the vehicle's motion above or below the road
 BLADE_STEPS = 4  # blade angles within half a turn, for the camera mask
+OUSTER_STAGGER_DEG = 4.2, 1.4, -1.4, -4.2  # azimuth offsets of an OS1's lasers: firmware manual, beam angles
 OPTIONAL_KEYS = ("other_drones", "truth_visible", "lidar_gaps_s")  # written to a scenario file only where used
 
 
@@ -57,14 +62,28 @@ class DroneSettings(_ScenarioSettings):
     path: Path
 
 
-class RigLidar(_ScenarioSettings):
-    """The LiDAR on its turntable, as in the rig file."""
+class RigLidar(rig_lidar.RigLidar):
+    """The LiDAR on its turntable, as in the rig file. An Ouster without beams gets evenly spaced ones."""
 
-    model: Literal["VLP-16"] = "VLP-16"
     mount: LidarMount = LidarMount(
         T_vehicle_turntable=Pose(xyz_m=(0.0, 0.0, 0.25)),
         T_turntable_lidar=Pose(xyz_m=(0.0, 0.0, 0.10), rpy_deg=(90.0, 0.0, 0.0)),
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_beams(cls, values: Any) -> Any:
+        model = values.get("model") if isinstance(values, dict) else None
+        if not isinstance(model, str) or model not in LIDAR_MODELS or not model.startswith("OS") or "beams" in values:
+            return values
+        profile = lidar_profile(model)
+        beams = rig_lidar.LidarBeams(
+            elevation_deg=profile.elevation_deg,
+            azimuth_deg=tuple(OUSTER_STAGGER_DEG[k % 4] for k in range(profile.lasers)),
+            origin_mm=profile.origin_mm,
+            packets="RNG19_RFL8_SIG16_NIR16",
+        )
+        return {**values, "beams": beams}
 
 
 class Scenario(_ScenarioSettings):
@@ -90,6 +109,7 @@ class Scenario(_ScenarioSettings):
     closed_loop: ClosedLoopSettings = ClosedLoopSettings()  # replaces the script with --closed-loop
     lidar_gaps_s: tuple[tuple[float, float], ...] = ()  # (from, to): no packet of the LiDAR arrives
     fix_sensor: FixSensorSettings | None = None  # instead of LiDAR and servo: fast, for graphs with SimulatedFixes
+    rotation_sensor: RotationSensorSettings | None = None  # instead of cameras, for graphs with SimulatedRotations
     truth_visible: bool = False  # write /truth/visible: the LiDAR's line of sight to each drone
     rig: RigLidar = RigLidar()  # the rig file attached to the recording
     true_mount: LidarMount | None = None  # the true mount of the LiDAR, if it differs from the rig file
@@ -166,7 +186,8 @@ class Scenario(_ScenarioSettings):
     def as_yaml(self) -> str:
         """The scenario as a file, with every setting (`OPTIONAL_KEYS` where used)."""
         unused = {name for name in OPTIONAL_KEYS if not getattr(self, name)}
-        settings = self.model_dump(mode="json", exclude_none=True, exclude=unused)
+        whole = self.model_copy(update={"lidar": self.lidar.of_model(self.rig.profile)})
+        settings = whole.model_dump(mode="json", exclude_none=True, exclude=unused)
         return yaml.safe_dump(settings, sort_keys=False, width=120)
 
     def rig_yaml(self) -> str:
@@ -181,9 +202,12 @@ class Scenario(_ScenarioSettings):
         return yaml.safe_dump(rig | ({"cameras": cameras} if cameras else {}), sort_keys=False)
 
 
-def load_scenario(path: FilePath) -> Scenario:
-    """Load a scenario file with its includes. ConfigError lists all problems with file and line."""
-    tree = load_tree(path)
+def load_scenario(path: FilePath, sets: Sequence[str] = ()) -> Scenario:
+    """Load a scenario file with its includes and changed settings (`autopilot.imu_hz=25`).
+
+    ConfigError lists all problems with file and line.
+    """
+    tree = load_tree(path, sets=sets)
     values = resolve(tree, (), tree.values)
     if not tree.errors:
         try:

@@ -11,13 +11,14 @@ from __future__ import annotations
 import json
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from flow.link import Record
 from links.simulated.sensors.drift import STEP_S, DriftingEstimate, DriftSettings
 from links.simulated.world.path import Path
 from links.simulated.world.suspension import SuspendedPath
-from stages.geometry.frames import quaternions_xyzw
+from stages.geometry.frames import Array64, quaternions_xyzw
 
 NS = 1_000_000_000
 
@@ -43,6 +44,7 @@ class VehicleOdometrySettings(BaseModel):
     latency_s: float = Field(default=0.004, ge=0, le=1)
     jitter_s: float = Field(default=0.001, ge=0, le=1)  # mean of an exponential distribution
     drift: WheelDriftSettings = WheelDriftSettings()
+    frozen_s: tuple[float, float] | None = None  # (from, to): new stamps with the pose of the first time
 
 
 class VehicleOdometry:
@@ -59,9 +61,13 @@ class VehicleOdometry:
         self._stamp_ns = start_ns + np.rint(time_s * NS).astype(np.int64)
         delay_s = settings.latency_s + rng.exponential(1.0, len(time_s)) * settings.jitter_s
         self._arrival_ns = np.maximum.accumulate(self._stamp_ns + np.rint(delay_s * NS).astype(np.int64))
-        rotations = estimate.rotations(time_s, path.level_poses(time_s)[0])
+        self._path, self._estimate, self._start_ns = path, estimate, start_ns
+        self._start = rotations[0], positions[0]
+        if settings.frozen_s is not None:
+            begin_s, end_s = settings.frozen_s
+            time_s = np.where((time_s >= begin_s) & (time_s < end_s), begin_s, time_s)
+        rotations, self._positions = self._poses(time_s)
         self._quaternions = quaternions_xyzw(rotations)
-        self._positions = estimate.position_m(time_s)
         self._covariances = estimate.covariances(time_s, rotations)
         self._sent = 0
 
@@ -69,6 +75,19 @@ class VehicleOdometry:
         """Poses measured before `until_ns` that were not returned yet."""
         first, self._sent = self._sent, int(np.searchsorted(self._stamp_ns, until_ns))
         return [self._record(row) for row in range(first, self._sent)]
+
+    def T_map_vehicle(self, stamp_ns: NDArray[np.int64]) -> tuple[Array64, Array64]:
+        """Poses with the drift, but not frozen, at times (n,): rotations (n, 3, 3), positions (n, 3) [m]."""
+        return self._poses(((stamp_ns - self._start_ns) * 1e-9).astype(np.float64))
+
+    def drift_m(self, time_s: float) -> Array64:
+        """Error of the position at a time, world axes, when the map's origin and axes are known (3,) [m]."""
+        at = np.array([time_s])
+        R, t = self._start
+        return R @ self._poses(at)[1][0] + t - self._path.level_poses(at)[1][0]
+
+    def _poses(self, time_s: Array64) -> tuple[Array64, Array64]:
+        return self._estimate.rotations(time_s, self._path.level_poses(time_s)[0]), self._estimate.position_m(time_s)
 
     def _record(self, row: int) -> Record:
         pose = {

@@ -35,8 +35,6 @@ from stages.kernels.compiled import compiled
 # Columns of the result.
 X, Y, Z, RANGE, LENGTH, DEPTH, COUNT, GAPS, SHADE, FREE, LASER, LONG, BULGE, ROUGH = range(14)
 FIRST, LAST, NEWEST = range(3)  # times per laser: its open chord's first and last hit, its newest pulse
-# A laser fires each 55.3 us (VLP-16). After a longer pause packets are lost, and it points in another direction.
-GAP_NS = 150_000
 
 
 @compiled
@@ -114,6 +112,7 @@ def find_chords(
     longest_m: float,
     jump_m: float,
     hole_m: float,
+    gap_ns: int,
     memory: Array64,
     times: NDArray[np.int64],
     rows: Array64,
@@ -128,7 +127,7 @@ def find_chords(
         r = float(range_m[i])
         seen = r > 0.0
         ended = False
-        if stamp_ns[i] - times[k, NEWEST] > GAP_NS:
+        if stamp_ns[i] - times[k, NEWEST] > gap_ns:
             if m[HITS] > 0.0:  # its continuation is unknown
                 _write_chord(m, m[MISSED] >= 2.0, k, m[LONG_REPORTED] > 0.0, rows[count])
                 row_ns[count, 0], row_ns[count, 1] = times[k, FIRST], times[k, LAST]

@@ -15,6 +15,8 @@ with t the first stamp of the new source and T_map_vehicle(t) extrapolated (stag
 happens when the start frame of a source jumps: its poses are rejected until three of them lie on one smooth path. Frame
 map is the start frame of the first source. The output has no jumps; it drifts. When the odometry turns out to be
 frozen or wrong, the last credible pose is published once more with status DENIED: the poses after it are withdrawn.
+An odometry that was frozen, with no other source since, keeps its start frame like one that was silent, if its pose is
+reachable and at least as far away as the hardest braking allows. Nearer, it has missed the path during the freeze.
 
 Source: ours; P V.B for the camera's motion.
 """
@@ -22,6 +24,7 @@ Source: ours; P V.B for the camera's motion.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections import Counter, deque
 from enum import Enum
 from typing import Any, ClassVar
@@ -31,13 +34,13 @@ from pydantic import Field
 
 from flow.counters import Counters
 from flow.stage import Settings, Stage
-from stages.geometry.extrapolation import AcceptedPoses, constant_turn_rate
+from stages.geometry.extrapolation import AcceptedPoses, constant_turn_rate, is_reachable, speed_mps
 from stages.geometry.frames import Array64, transform
 from stages.geometry.se3 import adjoint
 from stages.geometry.trajectory import VehicleTrajectory
 from stages.kernels.geometry.so3 import nearest_rotation
 from stages.messages import MotionStatus, SweptPulses, VehicleMotion
-from stages.odometry.vehicle.impossible_stop import ImpossibleStop
+from stages.odometry.vehicle.impossible_stop import ImpossibleStop, least_path_m
 from stages.odometry.vehicle.lidar_consistency import LidarConsistency
 from stages.odometry.vehicle.static_scan import StaticScan
 
@@ -73,6 +76,7 @@ class VehicleMotionSelector(Stage[VehicleMotionSelectorSettings]):
         self._at_change: tuple[VehicleMotion, Array64 | None] | None = None  # the source's pose, and P in frame map
         self._rejected: Counter[str] = Counter()
         self._stop = ImpossibleStop()
+        self._was_frozen = False  # the reason for which the odometry was denied last
         self._reported = VehicleTrajectory()  # by the odometry, also while it is denied
         self._waiting: deque[SweptPulses] = deque(maxlen=WAITING)  # slices that are newer than the odometry
         self._scan, self._consistency = StaticScan(), LidarConsistency()
@@ -108,7 +112,7 @@ class VehicleMotionSelector(Stage[VehicleMotionSelectorSettings]):
             oldest = self._waiting.popleft()
             error = self._scan.add(oldest, *self._reported.at(oldest.middle_ns))
             if error is not None and self._consistency.add(error):
-                return self._deny(error.stamp_ns - WITHDRAWN_NS)
+                return self._deny(error.stamp_ns - WITHDRAWN_NS, frozen=False)
         return None
 
     def _last_credible_ns(self, accepted: tuple[VehicleMotion, ...]) -> int | None:
@@ -118,10 +122,11 @@ class VehicleMotionSelector(Stage[VehicleMotionSelectorSettings]):
         stamps_ns = [self._stop.add(motion.stamp_ns, motion.xyz_map_m) for motion in accepted]
         return next((stamp_ns for stamp_ns in stamps_ns if stamp_ns is not None), None)
 
-    def _deny(self, credible_ns: int) -> VehicleMotion | None:
+    def _deny(self, credible_ns: int, frozen: bool) -> VehicleMotion | None:
         """Withdraw the published poses of the odometry after its last credible one; None: all are older."""
         self._rejected["odometry: denied"] += 1
-        self._accepted[MotionSource.ODOMETRY] = AcceptedPoses()  # when it moves again, it has a new start frame
+        self._accepted[MotionSource.ODOMETRY] = AcceptedPoses()
+        self._was_frozen = frozen
         if self._source is not MotionSource.ODOMETRY:
             return None
         self._source = None
@@ -149,14 +154,28 @@ class VehicleMotionSelector(Stage[VehicleMotionSelectorSettings]):
             return None
         credible_ns = self._last_credible_ns(accepted) if source is MotionSource.ODOMETRY else None
         if credible_ns is not None:
-            return self._deny(credible_ns)
+            return self._deny(credible_ns, frozen=True)
         if self._published and motion.stamp_ns <= self._published[-1].stamp_ns:
             return None
         if source is not self._source or len(accepted) > 1:
+            if not (self._source is None and source is MotionSource.ODOMETRY and self._continues(accepted[0])):
+                self._change_to(accepted[0])
             self._source = source
-            self._change_to(accepted[0])
         self._published.extend(map(self._in_map, accepted))
         return self._published[-1]
+
+    def _continues(self, motion: VehicleMotion) -> bool:
+        """Whether the odometry, which was frozen, continues its published poses in the same start frame."""
+        published = list(self._published)
+        v_mps = speed_mps(published) if self._was_frozen and published else None
+        if v_mps is None:
+            return False
+        here, there = self._in_map(motion), constant_turn_rate(published, motion.stamp_ns, until_s=math.inf)
+        gap_s = (motion.stamp_ns - published[-1].stamp_ns) * 1e-9
+        if math.dist(here.xyz_map_m, published[-1].xyz_map_m) < least_path_m(v_mps, gap_s):
+            return False
+        expected, measured = ((m.R_map_vehicle, m.xyz_map_m) for m in (there, here))
+        return is_reachable(expected, measured, gap_s, v_mps)
 
     def _in_map(self, motion: VehicleMotion) -> VehicleMotion:
         """A pose of the source, in frame map."""

@@ -22,7 +22,6 @@ from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
-import poselib  # pyright: ignore[reportMissingTypeStubs]
 from numpy.typing import NDArray
 
 from stages.geometry.frames import Array64
@@ -51,7 +50,14 @@ PROOF = 12 * math.log(
     1.0 + 5.0**2
 )  # minimum gain of a translation: the cost of twelve points with clear parallax under pure rotation
 
-_five_point = cast(Any, poselib).relpose_5pt
+try:
+    import poselib  # pyright: ignore[reportMissingTypeStubs]
+
+    _five_point = cast(Any, poselib).relpose_5pt
+except ModuleNotFoundError:  # on aarch64 it must be built: docs/how-to/install.md
+
+    def _five_point(*rays: Array64) -> list[Any]:
+        raise ModuleNotFoundError("visual odometry needs poselib: docs/how-to/install.md shows how to build it")
 
 
 @dataclass(frozen=True, slots=True)

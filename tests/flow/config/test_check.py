@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from flow.config.classes import known_classes
-from flow.config_error import ConfigError, Location
+from flow.config_error import ConfigError
 from flow.graph import Graph, load_graph
 from tests.flow.toys import GRAPH
 
@@ -231,6 +231,20 @@ def test_a_file_that_is_no_configuration(content, text, tmp_path):
     assert text in str(caught.value)
 
 
+def test_a_module_that_does_not_define_the_class_is_not_imported(tmp_path, monkeypatch):
+    """Importing a module executes it, and so does importing the packages around it."""
+    package = tmp_path / "intruding"
+    package.mkdir()
+    code = f"open({str(tmp_path / 'executed')!r}, 'w').close()\n"
+    (package / "__init__.py").write_text(code)
+    (package / "module.py").write_text(code + "import stages\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    for use in ("intruding.Double", "intruding.module.Double", "intruding.none.Double"):
+        text = GRAPH.replace("tests.flow.toys.Double", use)
+        assert only_error(tmp_path, text) == f"x.yaml:3: stages.double.use: unknown stage '{use}'."
+    assert not (tmp_path / "executed").exists()
+
+
 def test_only_a_driver_that_cannot_be_imported_is_not_suggested(monkeypatch):
     before = known_classes("links")
     for name in [name for name in sys.modules if name == "links.camera" or name.startswith("links.camera.")]:
@@ -241,7 +255,7 @@ def test_only_a_driver_that_cannot_be_imported_is_not_suggested(monkeypatch):
 
 def test_a_class_that_only_the_engine_makes_is_not_suggested():
     classes = known_classes("links")
-    assert classes["links.velodyne.Lidar"].__name__ == "Lidar"
+    assert classes["links.lidar.Lidar"].__name__ == "Lidar"
     assert not [path for path in classes if path.startswith("links.zenoh.")]  # a hosts file makes these
 
 
@@ -259,7 +273,7 @@ def test_set_changes_a_setting_by_the_stages_name(tmp_path):
         ("add.window", "--set add.window: must read NAME.SETTING=VALUE, as in --set track.radius_m=0.8."),
         ("add.window=0", "--set add.window=0: stages.add.config.window: must be greater than or equal to 1, got 0."),
         ("add.windw=4", "--set add.windw=4: stages.add.config.windw: unknown setting 'windw'. Did you mean 'window'?"),
-        ("add.window=[1", "--set add.window=[1: the value is not YAML: while parsing a flow sequence."),
+        ("add.window=[1", "--set add.window=[1: the value is not YAML: expected ',' or ']', but got '<stream end>'."),
     ],
 )
 def test_a_wrong_set_names_the_option(option, text, tmp_path):
@@ -342,7 +356,7 @@ def test_a_reference_to_itself_is_an_error(tmp_path):
 
 def test_a_recordings_rig_replaces_the_files_own_and_set_changes_both(tmp_path):
     (tmp_path / "x.yaml").write_text("rig: {a: own, b: own}\n" + GRAPH.replace("{name: adder}", "{name: $rig.a}"))
-    sections = {"rig": ({"a": "recorded"}, Location("street.mcap rig.yaml", 0))}
+    sections = {"rig": ("a: recorded", "street.mcap rig.yaml")}
     graph = load_graph(tmp_path / "x.yaml", sections=sections)
     assert (graph.nodes["add"].build().settings.name, graph.values["rig"]) == ("recorded", {"a": "recorded"})
     graph = load_graph(tmp_path / "x.yaml", sections=sections, sets=["rig.a=by hand"])

@@ -11,12 +11,12 @@ from flow.graph import load_graph
 
 CONFIG = """
 stages:
-  double: {use: toys.Double, inputs: {number: numbers.number}}
-  add: {use: toys.Add, config: {name: x}, inputs: {left: double.number, right: double.number, words: words.text}}
+  double: {use: tests.flow.toys.Double, inputs: {number: numbers.number}}
+  add: {use: tests.flow.toys.Add, config: {name: x}, inputs: {left: double.number, right: double.number, words: words.text}}
 links:
-  numbers: {use: toys.Numbers}
-  words: {use: toys.Words}
-  printer: {use: toys.Printer, inputs: {sum: add.sum}}
+  numbers: {use: tests.flow.toys.Numbers}
+  words: {use: tests.flow.toys.Words}
+  printer: {use: tests.flow.toys.Printer, inputs: {sum: add.sum}}
 """
 FILES = "certificate: c.pem, key: k.pem, authority: a.pem"
 GOOD = f"""
@@ -119,7 +119,9 @@ def test_a_file_that_is_no_hosts_file_is_an_error(load):
 
 
 def test_a_node_that_is_left_out_may_have_a_host(load):
-    config = CONFIG.replace("words: {use: toys.Words}", "words: {use: toys.Words, needs: $rig.radio}")
+    config = CONFIG.replace(
+        "words: {use: tests.flow.toys.Words}", "words: {use: tests.flow.toys.Words, needs: $rig.radio}"
+    )
     hosts = load(GOOD, config)
     assert "words" not in hosts.placement
     assert hosts.graph.left_out_texts() == ["the configuration has no $rig.radio: words left out"]

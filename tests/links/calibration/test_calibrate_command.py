@@ -15,6 +15,7 @@ from flow.graph import load_graph
 from links.calibration.gather import checked_rig, lidar_of
 from links.cli.files import read_rig
 from links.recording import RecordingReader, RecordingWriter
+from stages.geometry.rig_lidar import RigLidar
 from tests.links import command
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -64,7 +65,7 @@ def test_the_new_rig_can_be_laid_over_a_configuration(calibrated):
     assert mount.servo_time_offset_s == written["servo_time_offset_s"]
     assert abs(mount.servo_time_offset_s) < 2e-4  # this simulated servo has no error: none is invented
     assert list(mount.T_turntable_lidar.quaternion_xyzw) == written["T_turntable_lidar"]["quaternion_xyzw"]
-    assert checked_rig(read_rig(rig), "rig")[1] == mount
+    assert checked_rig(read_rig(rig), "rig")[1].mount == mount
 
 
 def test_the_figures_are_one_svg_with_four_charts(calibrated):
@@ -135,12 +136,10 @@ def test_a_small_odometry_drift_while_parked_is_decided_by_the_surfaces(tmp_path
 
 
 def test_the_lidars_clock_is_the_recorded_runs():
-    run = (
-        "links: {front: {use: links.velodyne.Lidar, config: {clock: utc, port: 2400}}, cam: {use: links.camera.Camera}}"
-    )
-    assert lidar_of(run).settings.clock == "utc"
-    for other in (None, "seed: 3", "links: null", "links: {front: {use: links.velodyne.Lidar}}", "- 1"):
-        assert lidar_of(other).settings.clock == "free"
+    run = "links: {front: {use: links.lidar.Lidar, config: {clock: utc, port: 2400}}, cam: {use: links.camera.Camera}}"
+    assert lidar_of(run, RigLidar()).settings.clock == "utc"
+    for other in (None, "seed: 3", "links: null", "links: {front: {use: links.lidar.Lidar}}", "- 1"):
+        assert lidar_of(other, RigLidar()).settings.clock == "free"
 
 
 def test_a_rig_is_written_to_a_yaml_file_only(tmp_path):

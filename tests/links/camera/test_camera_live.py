@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from flow.link import LinkError
 from links.camera import Camera
-from links.camera.capture import Capture, CaptureSettings, without_password
+from links.camera.capture import Capture, CaptureSettings
 from links.clock import host_time
 from links.recording import decode_compressed_image
 
@@ -193,7 +193,10 @@ def test_a_files_frames_are_stamped_by_its_own_timeline(tmp_path):
     [
         ("/dev/video-none", "there is no /dev/video-none. Is the camera plugged in and in webcam mode"),
         ("missing.mp4", "there is no file missing.mp4.*did you mean /dev/video0 or a URL"),
-        ("http://user:secret@127.0.0.1:9/x", r"http://127.0.0.1:9/x cannot be opened. Does another player open it"),
+        (
+            "http://user:secret@127.0.0.1:9/x",
+            r"http://\*\*\*@127.0.0.1:9/x cannot be opened. Does another player open it",
+        ),
         (None, "set `source` to run live"),
     ],
 )
@@ -210,11 +213,6 @@ def test_a_file_that_is_no_video_is_an_error(tmp_path):
     expected_text = r"no.avi cannot be opened. Is `source` the path of a video file"
     with pytest.raises(LinkError, match=expected_text), camera.listen() as records:
         next(records)
-
-
-def test_names_and_passwords_are_not_printed():
-    assert without_password("rtsp://crew:pass@192.168.1.9/live") == "rtsp://192.168.1.9/live"
-    assert without_password("/dev/video0") == "/dev/video0"
 
 
 @pytest.mark.parametrize("setting", [{"fps": 0}, {"latency_s": -0.1}, {"jpeg_quality": 10}, {"timeout_s": 0}])

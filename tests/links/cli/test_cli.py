@@ -54,6 +54,19 @@ def test_every_command_has_a_help_text_with_an_example(grd, command):
     assert f"Example: grd {command} " in grd(command, "--help").replace("\n  ", " ").replace("  ", " ")
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["view", "none.rrd"], "none.rrd: no such file"),
+        (["view", "none.rrd", "--tab", "Fusion"], "--screenshot"),
+        (["view", "none.rrd", "--size", "big", "--screenshot", "x.png"], "big is not WIDTHxHEIGHT"),
+        (["run", "street_sweep"], "street_sweep.mcap is a recording: grd replay"),
+    ],
+)
+def test_a_wrong_argument_is_explained(grd, arguments, message):
+    assert message in grd(*arguments, code=2)
+
+
 def test_quickstart_prints_the_position_of_the_drone_and_the_result_files(grd, tmp_path):
     text = grd("run", ROOT / "configs" / "quickstart.yaml")
     folder = tmp_path / "out" / "street_sweep-quickstart"
@@ -162,7 +175,7 @@ def test_a_truncated_recording_is_replayed_to_its_end_with_a_warning(grd, tmp_pa
 
 def test_a_configuration_without_a_recording_runs_live_and_reports_missing_devices(grd, tmp_path):
     overlay = without_viewer(tmp_path)
-    text = grd("run", ROOT / "configs" / "paper.yaml", "--for", 0.3, "--no-warm-up", "--overlay", overlay)
+    text = grd("run", ROOT / "configs" / "paper.yaml", "--for", 0.3, "--no-warm-up", "--overlay", overlay, code=1)
     assert "no links.recording.Recorder is configured: nothing is recorded" in text
     assert "no drone: no sweep was completed" in text
 

@@ -133,7 +133,7 @@ def test_two_commands_run_one_graph_on_two_hosts(tmp_path):
     assert summary["vehicle"]["messages"]["ticker.number"] > 10
     assert summary["base"]["messages"]["order.number"] > 10
     assert summary["base"]["counters"]["ticker"]["received"] > 10
-    again = grd("replay", tmp_path / "base" / "flight.mcap", "--as-live", "--out", tmp_path / "again")
+    again = grd("replay", tmp_path / "base" / "flight.mcap", "--as-live", "--trust", "--out", tmp_path / "again")
     assert again.exit_code == 2
     assert "was recorded on host 'base' of a run on several hosts" in again.output.replace("\n", " ")
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import pytest
 import yaml
 
@@ -60,6 +62,19 @@ def test_a_wrong_file_is_named_with_its_line_and_nothing_is_written(grd, tmp_pat
     assert "neither Kalibr's .yaml" in grd("lens", "lens.mat", "drone", code=2)
     assert grd("lens", "camchain.yaml", "bird", code=2)
     assert sorted(tmp_path.iterdir()) == sorted([*(f for f in before if f.suffix != ".txt"), tmp_path / "lens.mat"])
+
+
+def test_a_bomb_of_aliases_is_refused(grd, tmp_path):
+    names = "abcdefgh"
+    bomb = "a: &a [0,0,0,0,0,0,0,0,0]\n" + "".join(
+        f"{name}: &{name} [{', '.join([f'*{below}'] * 9)}]\n" for below, name in itertools.pairwise(names)
+    )
+    (tmp_path / "bomb.yaml").write_text(
+        bomb + KALIBR.replace("distortion_coeffs", "T_cam_imu: *h\n  distortion_coeffs")
+    )
+    assert "too large" in grd("lens", "bomb.yaml", "drone", code=2)
+    (tmp_path / "tag.yaml").write_text("cam0: !!bool 7\n")
+    assert "cannot be read" in grd("lens", "tag.yaml", "drone", code=2)
 
 
 def test_an_existing_file_is_overwritten_on_request_only_and_the_calibration_never(grd, tmp_path):

@@ -62,7 +62,7 @@ def test_a_live_run_writes_its_folder_and_is_repeated_to_the_same_hash(grd, tmp_
     assert summary["counters"]["recorder"]["dropped"] == 0
     assert (live["dropped"], live["events"], live["switched_off"]) == (0, [], [])
 
-    again = grd("replay", folder / "flight.mcap", "--as-live")
+    again = grd("replay", folder / "flight.mcap", "--as-live", "--trust")
     assert f"output hash {summary['output_hash']}" in again
     assert "the live run's hash is the same" in again
     repeated = json.loads((tmp_path / "out" / "flight-as-live" / "summary.json").read_text())
@@ -79,7 +79,7 @@ def test_a_run_in_several_parts_is_repeated_and_replayed_as_a_whole(grd, tmp_pat
     summary = json.loads((folder / "summary.json").read_text())
     parts = summary["counters"]["recorder"]["parts"]
     assert parts > 1
-    again = grd("replay", folder / "flight.mcap", "--as-live")
+    again = grd("replay", folder / "flight.mcap", "--as-live", "--trust")
     assert f"in {parts} parts" in again
     assert "the live run's hash is the same" in again
     plain = grd("replay", folder / "flight.mcap", "--config", "ticks.yaml", "--out", "plain")
@@ -90,7 +90,7 @@ def test_a_run_in_several_parts_is_repeated_and_replayed_as_a_whole(grd, tmp_pat
 
 
 def test_a_live_recording_has_the_sender_with_the_channel(tmp_path):
-    lidar = "  lidar: {use: links.velodyne.Lidar, config: {port: 42368, sender: 127.0.0.9}}\n"
+    lidar = "  lidar: {use: links.lidar.Lidar, config: {port: 42368, sender: 127.0.0.9}}\n"
     (tmp_path / "lidar.yaml").write_text(CONFIG.replace("  recorder: {use: links.recording.Recorder}\n", lidar))
     asked = RunRequest(tmp_path / "lidar.yaml")
     run_folder = RunFolder(tmp_path / "run", tmp_path / "flight.mcap", asked, live_graph(asked), live=True)
@@ -106,7 +106,7 @@ def test_a_live_recording_has_the_sender_with_the_channel(tmp_path):
 def test_a_repetition_that_differs_is_a_finding(grd, tmp_path, monkeypatch):
     grd("run", "ticks.yaml", "--for", 0.3, "--no-warm-up")
     monkeypatch.setattr("tests.flow.live_toys.Order.finish", lambda self: None)  # another version of a stage
-    text = grd("replay", tmp_path / "out" / "live-ticks" / "flight.mcap", "--as-live", code=1)
+    text = grd("replay", tmp_path / "out" / "live-ticks" / "flight.mcap", "--as-live", "--trust", code=1)
     assert "the live run's hash is " in text
     assert "the same" not in text
 
@@ -255,7 +255,7 @@ def test_a_run_killed_with_sigkill_loses_at_most_half_a_second_and_the_rest_can_
     assert arrival_ns(last) - ticks[-1].arrival_ns <= 500_000_000
     assert orders
     assert not (tmp_path / "run" / "summary.json").exists()
-    text = grd("replay", report.path, "--as-live", "--out", tmp_path / "again")
+    text = grd("replay", report.path, "--as-live", "--trust", "--out", tmp_path / "again")
     assert "the live run was interrupted, so its hash is not known" in text
     repeated = json.loads((tmp_path / "again" / "summary.json").read_text())
     assert 0 < repeated["messages"]["order.number"] <= 2 * len(ticks)

@@ -72,7 +72,7 @@ stages:
   motion: {use: stages.odometry.vehicle.VehicleMotionSelector, inputs: {odometry: odometry.vehicle_motion}}
 links:
   odometry: {use: links.vehicle_odometry.VehicleOdometry}
-  front: {use: links.velodyne.Lidar, config: {clock: CLOCK}}
+  front: {use: links.lidar.Lidar, config: {clock: CLOCK}}
 """
 
 
@@ -109,7 +109,7 @@ def test_a_recording_without_a_clock_setting_was_made_with_the_free_clock(drive,
     assert ("recorded with `clock: free`" in " ".join(text.split())) is (clock == "utc")
 
 
-@pytest.mark.parametrize("config", ["links: [", "links: 3", "links: {front: {use: links.velodyne.Lidar, config: 3}}"])
+@pytest.mark.parametrize("config", ["links: [", "links: 3", "links: {front: {use: links.lidar.Lidar, config: 3}}"])
 def test_a_recording_with_an_invalid_configuration_is_replayed_without_clock_warning(drive, config):
     with RecordingWriter(drive / "flight.mcap", config_yaml=config) as writer:
         pose = {"xyz_m": [0.0] * 3, "quaternion_xyzw": [0.0, 0.0, 0.0, 1.0], "covariance": None}

@@ -12,7 +12,7 @@ from flow.config.edge import Edge, QueueSettings
 from flow.counters import Counters
 from flow.live.report import EdgeCount, LinkReport, LinkState, LiveReport, edge_report
 from flow.taps import Digest
-from links.cli.live_view import LiveView
+from links.cli.live_view import LiveView, Rates
 from links.runs.live_run import RunStatus
 from stages.messages import (
     DroneFix,
@@ -68,13 +68,13 @@ def pose(state=PoseState.FULL, **changes):
     return RelativePose(**(values | changes))
 
 
-def shown(report, *messages, terminal=False, news=()):
+def shown(report, *messages, terminal=False, news=(), used=""):
     stream = io.StringIO()
     console = Console(file=stream, force_terminal=terminal, width=160, highlight=False, soft_wrap=True)
     with LiveView(console) as view:
         for message in messages:
             view.latest.see("x", message, 0)
-        view.show(RunStatus(12.34, lambda: report, list(news)))
+        view.show(RunStatus(12.34, lambda: report, list(news), used))
     return stream.getvalue()
 
 
@@ -116,14 +116,62 @@ def test_news_are_printed_at_once_between_two_lines(capsys):
     assert capsys.readouterr().err == "lidar: first\nlidar: second\n"
 
 
-def test_a_terminal_shows_every_edge_and_link():
-    text = shown(report_of(), pose(), terminal=True, news=["servo: stalled"])
-    for words in ("track.pulses", "sweep.swept_pulses", "150.0", "lidar", "lost 7", "FULL: seen now", "servo: stalled"):
+def test_a_terminal_shows_state_sources_the_bad_edges_and_the_newest_events():
+    text = shown(report_of(), pose(), terminal=True, news=["servo: stalled"], used="512 MB of memory, 41 GB free")
+    for words in ("track.pulses", "sweep.swept_pulses", "150.0", "lost 7", "FULL: seen now", "12.3 s  servo: stalled"):
         assert words in text
-    assert "fuse    rejected: fix: not finite 3" in text
+    assert "late; 512 MB of memory, 41 GB free" in text
+    assert "fuse: rejected: fix: not finite 3" in text
     for nothing in ("recorder", "back end reset"):
         assert nothing not in text
     assert "from other senders" not in text, "counts of zero are left out"
+
+
+def test_edges_without_losses_are_not_shown():
+    text = shown(report_of(lags_ms=(3.0,), dropped=0), pose(), terminal=True)
+    assert "track.pulses" not in text
+    assert "lag [ms]" not in text
+
+
+def test_a_source_has_its_rate_the_age_of_its_newest_record_and_its_status():
+    rates = Rates()
+    for now_s, count in ((10.0, 0), (10.5, 100), (12.0, 200), (12.5, 200)):
+        rates.add(now_s, {"lidar": count})
+    assert rates.texts(12.5, "lidar") == ("100.0", "0.5")
+    assert rates.texts(12.5, "servo") == ("", "")
+    report = report_of()
+    report.statuses = {"lidar": "its clock has jumped", "recorder": "the disk is full"}
+    text = shown(report, terminal=True)
+    assert "its clock has jumped  lost 7" in text
+    assert "the disk is full" in text
+
+
+def test_what_is_sent_to_the_autopilot_and_what_is_held_back_is_shown():
+    report = report_of()
+    assert "autopilot" not in shown(report, terminal=True)
+    report.counters["autopilot"] = Counters({"pose rejected: no yaw": 12, "sent: HEARTBEAT": 9})
+    assert "to the autopilot: nothing sent; held back: no yaw 12" in shown(report, terminal=True)
+    report.counters["autopilot"] = Counters({"pose rejected: no yaw": 12, "sent: ODOMETRY": 70})
+    assert "to the autopilot: ODOMETRY 70; held back: no yaw 12" in shown(report, terminal=True)
+
+
+def test_the_screen_of_a_bad_day_fits_24_rows_of_80_columns():
+    report = report_of()
+    for n in range(9):
+        report.links[f"source_{n}"] = LinkReport(LinkState.FAILED, 0, 1, reason="no packet on UDP 2368: " + "x" * 200)
+        report.edges[f"stage_{n}.input"] = report.edges["track.pulses"]
+        report.counters[f"stage_{n}"] = Counters({}, {"y" * 200: 3})
+    report.counters["autopilot"] = Counters({"pose rejected: no yaw": 12, "sent: ODOMETRY": 70})
+    stream = io.StringIO()
+    console = Console(file=stream, force_terminal=True, width=80, highlight=False, soft_wrap=True)
+    with LiveView(console) as view:
+        view.latest.see("x", pose(), 0)
+        screen = view._table(RunStatus(12.3, lambda: report, [], "512 MB"), 0.0)
+        for n in range(9):
+            view._events.append(f"event {n} {'z' * 200}")
+        screen = view._table(RunStatus(12.3, lambda: report, [], "512 MB"), 0.0)
+    rows = console.render_lines(screen, console.options.update(width=80))
+    assert len(rows) <= 24
 
 
 @pytest.mark.parametrize(("kind", "wanted"), [(RelativePose, True), (DroneFix, True), (Image, False)])

@@ -63,7 +63,7 @@ def odometry(
     )
 
 
-def test_the_outputs_are_the_six_messages():
+def test_the_outputs_are_the_six_messages_of_an_autopilot_and_the_state_of_an_earlier_run():
     assert set(output_ports(Autopilot)) == {
         "drone_attitude",
         "drone_local_position",
@@ -71,6 +71,7 @@ def test_the_outputs_are_the_six_messages():
         "drone_imu",
         "autopilot_status",
         "autopilot_estimator",
+        "earlier_odom_frame",
     }
 
 

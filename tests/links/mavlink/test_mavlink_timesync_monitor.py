@@ -10,19 +10,19 @@ import pytest
 from links.mavlink.timesync_monitor import (
     FIRST_WAIT_NS,
     GIVEN_UP,
-    LATE_FRAMES_NS,
-    LATE_NS,
+    LATE_FRAMES_WITHIN_NS,
+    MAX_LATENCY_NS,
     MAX_PENDING,
     MAX_WAIT_NS,
     PROVEN,
-    REQUEST_NS,
+    REQUEST_PERIOD_NS,
     UNANSWERED,
     TimesyncMonitor,
 )
 
 MS = 1_000_000
-LATE_MS = LATE_NS // MS + 1
-WAIT = FIRST_WAIT_NS // REQUEST_NS  # requests
+LATE_MS = MAX_LATENCY_NS // MS + 1
+WAIT = FIRST_WAIT_NS // REQUEST_PERIOD_NS  # requests
 
 
 class Requests:
@@ -36,7 +36,7 @@ class Requests:
         """Whether the link is late after each request with these round monitor; None: the reply is lost."""
         states: list[bool] = []
         for took in took_ms:
-            self.now_ns += REQUEST_NS
+            self.now_ns += REQUEST_PERIOD_NS
             self.monitor.on_request(self.now_ns)
             if active:
                 self.monitor.on_frame()
@@ -112,12 +112,12 @@ def test_an_active_autopilot_without_replies_gets_poses_again_after_half_a_minut
     requests.late_after([20])
     start_ns, reports = requests.now_ns, 0
     while requests.now_ns - start_ns < 60_000 * MS:
-        requests.now_ns += REQUEST_NS
+        requests.now_ns += REQUEST_PERIOD_NS
         reports += requests.monitor.on_request(requests.now_ns)
         requests.monitor.on_frame()
         elapsed_ns = requests.now_ns - start_ns
         assert requests.monitor.late == (
-            (UNANSWERED + 1) * REQUEST_NS <= elapsed_ns < GIVEN_UP * REQUEST_NS + FIRST_WAIT_NS
+            (UNANSWERED + 1) * REQUEST_PERIOD_NS <= elapsed_ns < GIVEN_UP * REQUEST_PERIOD_NS + FIRST_WAIT_NS
         )
     assert reports == 1
     assert "their latency is unknown" in (requests.monitor.status or "")
@@ -139,14 +139,14 @@ def test_after_a_silence_replies_are_optional_and_a_wait_continues_to_its_end():
 def test_two_late_frames_within_a_second_are_late_even_without_replies():
     monitor = TimesyncMonitor()
     monitor.on_late_frame(0)
-    monitor.on_late_frame(LATE_FRAMES_NS + 1)
+    monitor.on_late_frame(LATE_FRAMES_WITHIN_NS + 1)
     assert not monitor.late
-    monitor.on_late_frame(2 * LATE_FRAMES_NS)
+    monitor.on_late_frame(2 * LATE_FRAMES_WITHIN_NS)
     assert monitor.late
-    for request_ns in range(2 * LATE_FRAMES_NS, 2 * LATE_FRAMES_NS + FIRST_WAIT_NS, REQUEST_NS):
+    for request_ns in range(2 * LATE_FRAMES_WITHIN_NS, 2 * LATE_FRAMES_WITHIN_NS + FIRST_WAIT_NS, REQUEST_PERIOD_NS):
         monitor.on_request(request_ns)
         assert monitor.late
-    monitor.on_request(2 * LATE_FRAMES_NS + FIRST_WAIT_NS)
+    monitor.on_request(2 * LATE_FRAMES_WITHIN_NS + FIRST_WAIT_NS)
     assert not monitor.late
 
 

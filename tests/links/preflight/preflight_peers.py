@@ -13,16 +13,19 @@ from pymavlink.dialects.v20 import ardupilotmega
 
 from flow.link import Record
 from flow.stage import Settings, Stage
+from links.lidar import packet_format
+from links.lidar.velodyne import TIMESTAMP_AT
 from links.mavlink.profiles import required_parameters
 from links.mavlink.transport.framing import packed, parse_frame
 from links.simulated.autopilot.autopilot import Autopilot, AutopilotSettings
-from links.simulated.sensors.vlp16_packets import encode_packet
+from links.simulated.sensors.lidar_packets import PacketEncoder
 from links.simulated.world.flight import Flight
 from links.simulated.world.path import Path, Waypoint
-from links.velodyne import vlp16
+from stages.geometry.rig_lidar import RigLidar
 from stages.messages import DroneFix, DroneLocalPosition
 
 SPEED = 8.0  # rad/s, phase of a hand motion: forth and back in 0.4 s
+FORM = packet_format("VLP-16")
 START_NS, SECONDS = 1_748_773_230_000_000_000, 60.0
 
 
@@ -30,8 +33,9 @@ def packet(first_pulse_ns: int, mode: str = "strongest") -> bytes:
     """A VLP-16 packet in which every pulse returns from 10 m."""
     returns, firings = (2, 12) if mode == "dual" else (1, 24)
     shape = (returns, firings, 16)
-    azimuths = np.linspace(0.0, 0.08, firings // 2)
-    return encode_packet(first_pulse_ns, azimuths, np.full(shape, 10.0), np.full(shape, 50, np.uint8), mode)
+    azimuths = np.linspace(0.0, 0.08, firings)
+    encoder = PacketEncoder(RigLidar(), mode)
+    return encoder.encode(first_pulse_ns, azimuths, np.full(shape, 10.0), np.full(shape, 50, np.uint8))
 
 
 class SendingLidar:
@@ -51,7 +55,7 @@ class SendingLidar:
 
     def _run(self) -> None:
         template, sent, began_ns = bytearray(packet(0)), 0, time.monotonic_ns()
-        packet_ns, at = vlp16.packet_ns(vlp16.STRONGEST), vlp16.TIMESTAMP_AT
+        packet_ns, at = FORM.packet_ns("strongest"), TIMESTAMP_AT
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
             while not self._closed.wait(0.002):
                 while (sent + 1) * packet_ns < time.monotonic_ns() - began_ns:

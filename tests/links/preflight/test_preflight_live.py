@@ -13,13 +13,13 @@ from typer.testing import CliRunner
 
 from flow.graph import Graph, load_graph
 from links.cli.app import app
+from links.lidar.decode import compile_kernels
 from links.preflight.check_result import Level, is_go
 from links.preflight.preflight import preflight_live
 from links.simulated.autopilot.ardupilot_rules import ArduPilotRules
 from links.simulated.autopilot.autopilot_socket import AutopilotSocket
 from links.simulated.sensors.dynamixel_emulator import DynamixelEmulator
 from links.simulated.sensors.servo import ServoSettings
-from links.velodyne.decode import compile_kernels
 from tests.links.ports import free_port
 from tests.links.preflight.preflight_peers import (
     START_NS,

@@ -9,12 +9,12 @@ import pytest
 
 from flow.link import Record, Source
 from links.camera import Camera
+from links.lidar import Lidar
 from links.preflight.check_result import Level
 from links.preflight.devices import checks_for
 from links.preflight.observations import Observations, ObservedSource
 from links.recording import Recorder
 from links.recording.checks import disk_check, existing
-from links.velodyne import Lidar
 
 LIDAR, CAMERA = Lidar(), Camera(topic="/camera/drone")
 

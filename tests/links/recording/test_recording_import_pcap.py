@@ -19,10 +19,11 @@ RECORDINGS = Path(__file__).resolve().parents[3] / "recordings"
 
 
 def data_packet(number: int, product: int = 0x22) -> bytes:
-    """A VLP-16 data packet as the importer sees it: the right length, return mode and product id at the end."""
-    return bytes([number]) * 1204 + bytes([0x37, product])
+    """A Velodyne data packet as the importer sees it: length, flags of blocks, return mode and product id."""
+    return (b"\xff\xee" + bytes([number]) * 98) * 12 + bytes([number]) * 4 + bytes([0x37, product])
 
 
+RIG = "version: 1\nlidar: {model: VLP-16}\n"
 PACKETS = [data_packet(i) for i in range(4)]
 
 
@@ -151,17 +152,17 @@ def test_another_port_is_suggested_and_accepted(tmp_path: Path):
 
 
 def test_a_capture_without_a_lidar_is_an_error_with_its_content(tmp_path: Path):
-    with pytest.raises(LinkError, match=r"no VLP-16 packet .* on UDP port 2368; 2 packets on UDP port 53"):
+    with pytest.raises(LinkError, match=r"no LiDAR packet on UDP port 2368; 2 packets on UDP port 53"):
         run(tmp_path, pcap([ethernet(udp(b"dns", port=53))] * 2))
     assert not (tmp_path / "drive.mcap").exists()
 
 
 @pytest.mark.parametrize(
-    ("product", "name"), [(0x21, "HDL-32E"), (0x28, "VLP-32C"), (0x99, r"an unknown model \(product id 0x99\)")]
+    ("product", "name"), [(0x21, "Velodyne HDL-32E"), (0x28, "Velodyne VLP-32C"), (0x99, "an unknown model")]
 )
 def test_another_model_is_rejected_by_name_and_leaves_no_file(tmp_path: Path, product: int, name: str):
     content = pcap([ethernet(udp(PACKETS[0])), ethernet(udp(data_packet(1, product)))])
-    with pytest.raises(LinkError, match=f"the packet at byte 1288 is from {name}, not a VLP-16"):
+    with pytest.raises(LinkError, match=f"the packet at byte 1288 is from {name}.*, not a VLP-16"):
         run(tmp_path, content)
     assert not (tmp_path / "drive.mcap").exists()
 
@@ -178,13 +179,13 @@ def test_a_given_rig_is_attached_and_the_default_one_is_marked_as_a_guess(tmp_pa
         assert reader.metadata == {"imported_from": "drive.pcap"}
         known = {"model": "VLP-16", "sender": "192.168.1.201"}
         assert reader.channels == {"/lidar/packets": {**known, "port": "2368"}}
-    report, _ = run(tmp_path, content, rig_yaml="version: 1\n")
+    report, _ = run(tmp_path, content, rig_yaml=RIG)
     with RecordingReader(report.path) as reader:
-        assert reader.rig_yaml == "version: 1\n"
+        assert reader.rig_yaml == RIG
 
 
 def test_the_default_rig_is_a_valid_mount_that_does_not_turn(tmp_path: Path):
-    rig = yaml.safe_load(DEFAULT_RIG)
+    rig = yaml.safe_load(DEFAULT_RIG.format(model="XT32"))
     mount = LidarMount.model_validate(rig["lidar"]["mount"])
     assert set(rig) == {"version", "lidar", "drone"}
     assert not mount.turns
@@ -269,9 +270,13 @@ def test_the_real_captures_are_imported_completely(tmp_path: Path):
     assert report.topics == {"/lidar/packets": 293, "/lidar/position": 57}
     with RecordingReader(report.path) as reader:
         assert [r.data.count(b"$GPRMC") for r in reader.records({"/lidar/position"})] == [1] * 57
-    with pytest.raises(LinkError, match="is from HDL-32E, not a VLP-16"):
-        import_file(SHARED / "hdl32_mrpt_WRONG_MODEL.pcap", tmp_path / "c.mcap")
+    with pytest.raises(LinkError, match=r"is from Velodyne HDL-32E .*, not a VLP-16"):
+        import_file(SHARED / "hdl32_mrpt_WRONG_MODEL.pcap", tmp_path / "c.mcap", rig_yaml=RIG)
     assert not (tmp_path / "c.mcap").exists()
+    report = import_file(SHARED / "hdl32_mrpt_WRONG_MODEL.pcap", tmp_path / "c.mcap")
+    with RecordingReader(report.path) as reader:
+        assert yaml.safe_load(reader.rig_yaml or "")["lidar"]["model"] == "HDL-32E"
+        assert reader.channels["/lidar/packets"]["model"] == "HDL-32E"
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 import struct
 from pathlib import Path
+from typing import IO, cast
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -12,7 +13,7 @@ from pymavlink.generator.mavcrc import x25crc
 
 from flow.link import LinkError, Record
 from links.recording import ImportReport, RecordingReader, import_file
-from links.recording.tlog import x25
+from links.recording.tlog import BLOCK_BYTES, TlogReport, read_frames, x25
 
 SHARED = Path(__file__).resolve().parents[4] / "shared" / "data" / "mavlink"
 T0_US = 1_700_000_000_000_000
@@ -121,6 +122,46 @@ def test_a_file_without_frames_is_rejected(tmp_path: Path, content: bytes):
     with pytest.raises(LinkError, match=r"no MAVLink frame in [0-9]+ bytes: is it a telemetry log"):
         run(tmp_path, content)
     assert not (tmp_path / "flight.mcap").exists()
+
+
+def test_a_log_larger_than_the_memory_is_read_block_by_block(tmp_path: Path):
+    """A sparse file of 300 MB with a frame in front and one at its end, in a process with little more memory."""
+    first, last = frames(count=2)
+    path = tmp_path / "long.tlog"
+    with path.open("wb") as stream:
+        stream.write(tlog([first]) * 40_000)  # 1.5 MB: frames on both sides of a block's end
+        stream.seek(300_000_000)
+    report = TlogReport()
+
+    class Counted:
+        """Counts the bytes of each read."""
+
+        def __init__(self, stream: IO[bytes]) -> None:
+            self.stream, self.sizes = stream, list[int]()
+
+        def read(self, size: int = -1) -> bytes:
+            self.sizes.append(size)
+            if len(self.sizes) == 4:  # the rest is zeros: skip it, a byte at a time takes minutes
+                self.stream.seek(0, 2)
+            return self.stream.read(size)
+
+    with path.open("rb") as stream:
+        counted = Counted(stream)
+        found = [frame for _, frame in read_frames(cast(IO[bytes], counted), path, report)]
+    assert found == [first] * 40_000
+    assert last not in found
+    assert set(counted.sizes) == {BLOCK_BYTES}
+
+
+@pytest.mark.parametrize("block", [1, 7, 64, 4096])
+def test_the_size_of_a_block_changes_nothing(tmp_path: Path, block: int, monkeypatch: pytest.MonkeyPatch):
+    sent = frames(count=30)
+    content = tlog([*sent[:9], b"\x01\x02\xfe\x03garbage", *sent[9:]])
+    whole, records = run(tmp_path, content)
+    monkeypatch.setattr("links.recording.tlog.BLOCK_BYTES", block)
+    report, again = run(tmp_path, content)
+    assert [r.data for r in again] == [r.data for r in records] == sent
+    assert (report.skipped, report.warnings) == (whole.skipped, whole.warnings)
 
 
 def test_a_file_that_is_neither_capture_nor_log_is_rejected_and_a_recording_is_recognised(tmp_path: Path):

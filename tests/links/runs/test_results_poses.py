@@ -12,9 +12,8 @@ from flow.link import Run
 from links.evaluation.run_data import OutputKind, read_output
 from links.mavlink.poses.gate import PoseLimits
 from links.runs.results import POSE_COVARIANCE_FILE, POSE_FILE, UNKNOWN_RAD2, Results
-from stages.fuse.motion_model import Motions
+from stages.fuse.map_frame import MapFrame
 from stages.fuse.pose_message import MapEstimate, Status, lost, pose
-from stages.fuse.settings import FuseErrors
 from stages.geometry.frames import quaternions_xyzw, rotation_z
 from stages.messages import DroneFix, PoseState, RelativePose, SweptPulses
 
@@ -28,7 +27,7 @@ def status(state, resets=0, track_id=1):
 
 def made(t_s, R=None, state=FULL, xyz=(1.0, 2.0, 3.0), variances=(0.001, 0.002, 0.003, 0.01, 0.02, 0.03)):
     known = MapEstimate(round(t_s * S), R, np.array(xyz), np.diag(variances), np.zeros(3), np.eye(3))
-    return pose(known, status(state), Motions(FuseErrors(), parked=True))
+    return pose(known, status(state), MapFrame(parked=True))
 
 
 @pytest.fixture
@@ -60,7 +59,7 @@ def test_each_pose_has_the_number_of_its_drone(run):
         MapEstimate(t * S, None, np.array([x, 2.0, 3.0]), np.eye(6), np.zeros(3), np.eye(3))
         for t, x in ((1, 1), (2, 30))
     ]
-    parked = Motions(FuseErrors(), parked=True)
+    parked = MapFrame(parked=True)
     folder = run([pose(one, status(POSITION_ONLY, track_id=k), parked) for k, one in enumerate(known, start=1)])
     back = read_output(OutputKind.POSE, folder)
     assert back.track.tolist() == [1, 2]
@@ -127,10 +126,10 @@ def test_poses_are_counted_by_state_and_their_jumps_reported(tmp_path):
     unknown = pose(
         MapEstimate(S, None, np.ones(3), np.eye(6), np.zeros(3), np.eye(3)),
         status(POSITION_ONLY),
-        Motions(FuseErrors(), parked=True),
+        MapFrame(parked=True),
     )
     turned = MapEstimate(2 * S, rotation_z(0.5), np.ones(3), np.eye(6), np.zeros(3), np.eye(3))
-    for message in (unknown, *[pose(turned, status(FULL, resets=1), Motions(FuseErrors(), parked=True))] * 2):
+    for message in (unknown, *[pose(turned, status(FULL, resets=1), MapFrame(parked=True))] * 2):
         results.see("fuse.relative_pose", message, message.stamp_ns)
     results.close()
     assert results.pose_states == {"FULL": 2, "POSITION_ONLY": 1}

@@ -16,6 +16,6 @@ stages:
     use: stages.track.MeanShiftTrack
     inputs: {points: sweep.swept_points, detections: detect.detections}
 links:
-  lidar: {use: links.velodyne.Lidar}
+  lidar: {use: links.lidar.Lidar}
   servo: {use: links.dynamixel.Servo, inputs: {goal: aim.servo_goal}}
 """

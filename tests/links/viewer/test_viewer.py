@@ -113,6 +113,7 @@ def test_lost_packets_add_up_in_a_slice():
     joined = join([firings, dataclasses.replace(firings, lost_packets=3), dataclasses.replace(firings, lost_packets=2)])
     assert joined.lost_packets == 5
     assert joined.range_m.shape == (3 * 384,)
+    assert len(joined.laser_elevation_rad) == 16  # of the lasers, not of the pulses
 
 
 def test_thinning_keeps_every_lone_return():
@@ -168,7 +169,7 @@ def test_the_timeline_counts_from_1970_or_from_the_start_of_the_run(tmp_path, st
     (chunk,) = [
         c
         for c in RrdReader(tmp_path / "run.rrd").stream().to_chunks()
-        if c.entity_path == "/plots/other/clock/tick/count" and not c.is_static
+        if c.entity_path == "/plots/fields/clock/tick/count" and not c.is_static
     ]
     times = chunk.to_record_batch().column("sensor_time")
     assert str(times.type).startswith(kind)
@@ -183,7 +184,7 @@ def test_dropped_messages_are_counted_and_the_newest_is_drawn(tmp_path):
     viewer.close()
     dropped = viewer.dropped["clock.tick"]
     found = rows(tmp_path / "run.rrd")
-    assert found["/plots/other/clock/tick/count"] + dropped == 5000
+    assert found["/plots/fields/clock/tick/count"] + dropped == 5000
     assert found["/log/viewer"] >= 1  # the recording reports its own gaps
 
 
@@ -296,7 +297,7 @@ def test_a_serving_run_listens_on_loopback_only(tmp_path):
     viewer.see("clock.tick", ticks(1)[0], 0)
     viewer.close()
     assert viewer.errors == {}
-    assert rows(tmp_path / "run.rrd")["/plots/other/clock/tick/count"] == 1  # the file is written as well
+    assert rows(tmp_path / "run.rrd")["/plots/fields/clock/tick/count"] == 1  # the file is written as well
 
 
 def test_a_port_in_use_is_reported_and_the_file_is_written(tmp_path):
@@ -309,7 +310,7 @@ def test_a_port_in_use_is_reported_and_the_file_is_written(tmp_path):
         viewer.close()
     (text,) = viewer.errors
     assert text.startswith(f"port {viewer.settings.port} is in use")
-    assert rows(tmp_path / "run.rrd")["/plots/other/clock/tick/count"] == 1
+    assert rows(tmp_path / "run.rrd")["/plots/fields/clock/tick/count"] == 1
 
 
 def test_without_file_and_server_nothing_is_drawn(tmp_path, monkeypatch):

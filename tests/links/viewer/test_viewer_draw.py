@@ -207,6 +207,17 @@ def test_the_range_image_has_the_highest_beam_on_top():
     assert pixels[row, column] * 0.002 == pytest.approx(float(firings.range_m[pulse]), abs=0.06)
 
 
+def test_the_fan_has_the_elevations_of_the_lidar_that_sends():
+    firings, _ = synthetic.packet(0.0)
+    wide = dataclasses.replace(firings, laser_elevation_rad=np.deg2rad([-30.0, 10.0]), laser=firings.laser % 2)
+    where = scene(mount=synthetic.MOUNT)
+    fan = drawn(wide, "lidar/lidar_firings", where)["lidar/fan"].archetypes[0]
+    strips = np.array(fan.strips.as_arrow_array().to_pylist())
+    elevations_deg = np.degrees(np.arctan2(strips[..., 2], np.linalg.norm(strips[..., :2], axis=-1)))
+    np.testing.assert_allclose(elevations_deg, np.repeat([[-30.0], [10.0]], strips.shape[1], axis=1), atol=1e-4)
+    assert "lidar/fan" not in drawn(wide, "lidar/lidar_firings", where), "only when it changes"
+
+
 def test_empty_depth_stays_empty_and_a_lone_pixel_grows_to_three():
     depth = np.zeros((20, 30), np.float32)
     depth[5, 7] = 12.0
@@ -260,11 +271,11 @@ def test_a_message_of_unknown_type_is_visible_field_by_field():
         samples=np.arange(100.0),
     )
     entities = drawn(content, "power/unknown")
-    assert entities["plots/other/power/unknown/level_v"].values == [12.5]
-    assert entities["plots/other/power/unknown/count"].values == [3]
-    assert entities["plots/other/power/unknown/healthy"].values == [1]
+    assert entities["plots/fields/power/unknown/level_v"].values == [12.5]
+    assert entities["plots/fields/power/unknown/count"].values == [3]
+    assert entities["plots/fields/power/unknown/healthy"].values == [1]
     assert entities["states/power/unknown/mode"].archetypes[0].state.as_arrow_array().to_pylist() == ["CALM"]
     assert entities["log/power/unknown/text"].archetypes[0].text.as_arrow_array().to_pylist() == ["hello"]
     assert entities["vehicle/power/unknown/points_vehicle_m"].frame == "vehicle"
-    assert len(entities["plots/other/power/unknown/covariance_m2"].values) == 9
-    np.testing.assert_allclose(entities["plots/other/power/unknown/samples"].values, [100, 0.0, 49.5, 99.0])
+    assert len(entities["plots/fields/power/unknown/covariance_m2"].values) == 9
+    np.testing.assert_allclose(entities["plots/fields/power/unknown/samples"].values, [100, 0.0, 49.5, 99.0])

@@ -80,11 +80,25 @@ def test_a_candidate_is_a_coloured_point_with_number_and_reason():
     ]
     assert values_of(entities["labels/detect/candidates"].archetypes[0].labels) == ["7: 20.0 %", "3: 99.9 %"]
     packed = numbers(dots.archetypes[0].colors).astype(int).ravel().tolist()
-    assert packed == colours.by_probability(found.probability).tolist()
+    assert packed == [int(colours.by_probability(found.probability)[0]), colours.ACCEPTED]
     percent = entities["plots/probability/detect/candidates"].values
-    np.testing.assert_allclose(percent, [99.9, 20.0])
+    np.testing.assert_allclose(percent, [99.9, 20.0, 95.0])  # the last is where a candidate is accepted
     text = document(entities["candidates"])
     assert "- 7: 20.0 %, last return 0.5 s ago at 1.0 / 2.0 / 7.0 m: it may be static" in text
+
+
+def test_of_many_candidates_the_followed_one_and_the_most_probable_ones_are_named():
+    where = scene()
+    position_m = np.array([1.0, 2.0, 5.0])  # that of candidate 5
+    drawn(state(TrackingState.CANDIDATE, 0, xyz_vehicle_m=position_m), "track/track_state", where)
+    many = {f"c{n}": (0.05 * n if n != 5 else 0.01, "x") for n in range(1, 11)}
+    entities = drawn(candidates(1, **many), "detect/candidates", where)
+    labels = values_of(entities["labels/detect/candidates"].archetypes[0].labels)
+    assert labels == ["5: 1.0 %, followed", "8: 40.0 %", "9: 45.0 %", "10: 50.0 %"]
+    dots = entities["vehicle/detect/candidates"].archetypes[0]
+    packed, radii = numbers(dots.colors).astype(int).ravel(), numbers(dots.radii).ravel()
+    assert np.flatnonzero(packed == colours.DRONE).tolist() == [4]
+    assert np.argmax(np.abs(radii)) == 4
 
 
 def test_colours_go_from_red_over_violet_to_green_linearly_in_the_log_odds():
@@ -102,7 +116,7 @@ def test_an_empty_list_of_candidates_removes_the_points():
     entities = drawn(candidates(1), "detect/candidates", where)
     assert len(numbers(entities["vehicle/detect/candidates"].archetypes[0].positions)) == 0
     assert len(numbers(entities["labels/detect/candidates"].archetypes[0].positions)) == 0
-    np.testing.assert_allclose(entities["plots/probability/detect/candidates"].values, [0.0, 0.0])
+    np.testing.assert_allclose(entities["plots/probability/detect/candidates"].values, [0.0, 0.0, 95.0])
     assert "no candidate" in document(entities["candidates"])
 
 
@@ -307,14 +321,14 @@ def test_pulses_are_counted_per_slice_and_not_drawn():
     ((_, stamp_ns, joined),) = ready
     assert stamp_ns == 75 * 1_327_104  # 0.1 s; the packet after it is in the next slice
     entities = drawn(joined, "sweep/swept_pulses")
-    assert set(entities) == {"plots/other/sweep/swept_pulses/pulses", "plots/other/sweep/swept_pulses/empty"}
-    np.testing.assert_allclose(entities["plots/other/sweep/swept_pulses/pulses"].values, [76 * 4])
+    assert set(entities) == {"plots/count/sweep/swept_pulses/pulses", "plots/other/sweep/swept_pulses/empty"}
+    np.testing.assert_allclose(entities["plots/count/sweep/swept_pulses/pulses"].values, [76 * 4])
     np.testing.assert_allclose(entities["plots/other/sweep/swept_pulses/empty"].values, [50.0])
 
 
 def test_a_slice_without_pulses_has_no_share():
     entities = drawn(pulses(0, []), "sweep/swept_pulses")
-    assert set(entities) == {"plots/other/sweep/swept_pulses/pulses"}
+    assert set(entities) == {"plots/count/sweep/swept_pulses/pulses"}
 
 
 def test_the_servo_goal_is_a_stepped_curve_next_to_the_servo_angle():

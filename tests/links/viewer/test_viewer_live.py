@@ -13,8 +13,8 @@ from flow.live.report import EdgeStatus
 def test_lag_and_drops_of_an_edge_are_curves(name, value):
     status = EdgeStatus(stamp_ns=1, lag_ms=12.5, dropped=3, missed=1, waiting=7)
     entities = drawn(status, "run/track/pulses")
-    assert set(entities) == {f"plots/other/run/track/pulses/{n}" for n in ("lag_ms", "dropped", "missed", "waiting")}
-    assert entities[f"plots/other/run/track/pulses/{name}"].values.tolist() == [value]
+    assert set(entities) == {f"plots/fields/run/track/pulses/{n}" for n in ("lag_ms", "dropped", "missed", "waiting")}
+    assert entities[f"plots/fields/run/track/pulses/{name}"].values.tolist() == [value]
 
 
 @pytest.mark.parametrize(("resolved", "level"), [(False, "WARN"), (True, "INFO")])

@@ -146,9 +146,10 @@ def test_camera_views_exist_only_when_the_graph_has_their_outputs():
     everything = Vision(["camera_drone"], directions=True, rotation=True, odometry=True)
     added = names(everything) - without
     assert "camera drone" in added
-    assert len(added) == 7
+    assert len(added) == 8, "seven views, and the tab"
     assert names(Vision(rotation=True)) - without == {
-        "Yaw branch probabilities [%]",
-        "Rotation of the drone in the vehicle frame [deg]",
-        "Sigma of the rotation [deg]",
+        "Rotation",
+        "Yaw [%]: branch 0 deg green, 90 orange, 180 violet, 270 blue, none red; within 20 deg of the best grey",
+        "Rotation in the vehicle frame [deg]: roll red, pitch green, yaw blue",
+        "Sigma of the rotation [deg], about x red, y green, z blue",
     }

@@ -14,7 +14,7 @@ from stages.calibration.patches import find_patches
 from stages.calibration.result import Travel, unseen
 from stages.calibration.scan_passes import Returns, ServoAt, ServoTrace, servo_at, smoothed
 from stages.calibration.servo_mount import harmonics, lidar_mount, servo_mount
-from stages.calibration.solve import NAMES, clustered, linearise, sandwich, surfaces, without_planes
+from stages.calibration.solve import NAMES, clustered, linearise, prior_information, sandwich, surfaces, without_planes
 from stages.geometry.frames import Harmonic, LidarMount, Pose
 from stages.kernels.calibration.scan_passes import play_sides
 from tests.stages.calibration.made_sweep import STEP_RAD, YARD, sweep, wrong_mount
@@ -88,7 +88,7 @@ def test_every_column_is_the_derivative_by_its_parameter():
     for name in NAMES:
         slope = (away({name: 1e-6}) - away({name: -1e-6})) / 2e-6
         assert columns[name] == pytest.approx(slope, abs=1e-5), name
-    lasers = laser_columns(placed, normal, returns.laser)
+    lasers = laser_columns(placed, normal, returns.laser, 16)
     for laser in (0, 7, 15):
         bias = np.eye(16)[laser] * 1e-6
         assert lasers[:, laser] == pytest.approx((away({}, bias) - away({})) / 1e-6, abs=1e-6)
@@ -228,5 +228,6 @@ def test_errors_common_to_a_surface_increase_the_sigmas():
     together = replace(system, residual=size * along * rng.choice([-1, 1], surface.max() + 1)[surface])
     separate = replace(system, residual=size * rng.choice([-1, 1], len(size)))
     moments = np.arange(len(size)) * 10**9  # no two returns at one moment
-    ratio = np.sqrt(np.diag(sandwich(together, moments))[0] / np.diag(sandwich(separate, moments))[0])
+    wide, narrow = (np.diag(sandwich(each, moments, prior_information(16)))[0] for each in (together, separate))
+    ratio = np.sqrt(wide / narrow)
     assert ratio > 5

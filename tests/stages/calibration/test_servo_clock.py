@@ -15,8 +15,8 @@ from pydantic import ValidationError
 
 from flow.message import check_arrays
 from links.dynamixel import Servo
+from links.lidar import Lidar
 from links.recording import RecordingReader
-from links.velodyne import Lidar
 from stages.calibration.servo_clock import ServoClock, both_ways_rad
 from stages.calibration.servo_mount import servo_mount
 from stages.geometry.frames import LidarMount

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from stages.detect.chords import ChordFinder
+from stages.geometry.lidar_models import lidar_profile
 from stages.kernels.detect import chords as chord
 from stages.messages import SweptPulses
 from tests.stages.caster import Ball, Box, Wire, cast, flying, pulses_seen, still, sweeping
@@ -39,7 +40,7 @@ def pulses(ranges_m, first=0, lasers=None, origin_m=ORIGIN_M, reflectivity=30) -
 
 
 def finder(longest_m=0.8, jump_m=0.35, hole_m=0.3) -> ChordFinder:
-    return ChordFinder(longest_m, jump_m, hole_m)
+    return ChordFinder(longest_m, jump_m, hole_m, lidar_profile("VLP-16"))
 
 
 def feed(*slices, **settings):

@@ -1,16 +1,14 @@
 """Inputs of the fusion in a recorded flight, taken from a replay once, so that they can be fused repeatedly.
 
-A fault removes, delays or falsifies inputs. `judge` compares the poses with the truth.
+`judge` compares the poses with the truth.
 """
 
 from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -22,15 +20,13 @@ from links.recording import RecordingReader
 from links.runs.request import RunRequest
 from links.runs.truth import TruthLog
 from stages.fuse import Fuse
-from stages.geometry.frames import rotation_from_quaternion_xyzw
+from stages.geometry.frames import rotation_from_quaternion_xyzw, rotation_z
 from stages.kernels.geometry.so3 import exp_rotation, log_rotation
-from stages.messages import DroneFix, PoseState, RelativePose, RelativeRotation
-from tests.stages.fuse.made_drone_flight import Errors, add_errors, gauss_markov, rotation
+from stages.messages import DroneFix, PoseEstimate, PoseState, RelativePose, RelativeRotation
+from tests.stages.fuse.fuse_inputs import Event, Fault, poses_of, rotation
+from tests.stages.fuse.imu_flights import gauss_markov
 
-GRID_S = 0.02
 CHI2_95_3 = 7.814728
-Event = tuple[int, str, Any]  # arrival [ns], port, message
-Fault = Callable[[list[Event]], list[Event]]
 
 
 @dataclass
@@ -57,10 +53,7 @@ class RecordedFlight:
 
     def fuse(self, stage: Fuse | None = None, fault: Fault | None = None) -> list[RelativePose]:
         """Poses of the fusion of these inputs, with a fault."""
-        stage, poses = stage or Fuse(), []
-        for _, port, message in fault(self.events) if fault else self.events:
-            poses += getattr(stage, f"on_{port}")(message)
-        return poses
+        return poses_of(stage or Fuse(), fault(self.events) if fault else self.events)
 
 
 def recorded_inputs(recording: Path, config: Path, fuse: str = "fuse") -> RecordedFlight:
@@ -108,73 +101,20 @@ class InputTap(Tap):
         return [event for *_, event in sorted(self._events, key=lambda e: e[:3])]
 
 
-# faults
-
-
-def without(ports: tuple[str, ...], from_s: float = -math.inf, until_s: float = math.inf) -> Fault:
-    """Messages of these ports between two times of the flight, by their stamps, are lost."""
-
-    def fault(events: list[Event]) -> list[Event]:
-        first = events[0][0]
-        return [e for e in events if e[1] not in ports or not from_s <= (e[2].stamp_ns - first) * 1e-9 < until_s]
-
-    return fault
-
-
-def late(ports: tuple[str, ...], by_s: float) -> Fault:
-    """Messages of these ports are delayed, in the same order."""
-
-    def fault(events: list[Event]) -> list[Event]:
-        moved = [(at + round(by_s * 1e9) if port in ports else at, port, m) for at, port, m in events]
-        return sorted(moved, key=lambda e: e[0])
-
-    return fault
-
-
-def outliers(ports: tuple[str, ...], share: float, seed: int = 1) -> Fault:
-    """This share of the messages of these ports is false: positions by metres, rotations by tens of degrees."""
-
-    def fault(events: list[Event]) -> list[Event]:
-        rng = np.random.default_rng(seed)
-        return [
-            (at, port, falsified(m, rng) if port in ports and rng.random() < share else m) for at, port, m in events
-        ]
-
-    return fault
-
-
-def falsified(message: Any, rng: np.random.Generator) -> Any:
-    """The same message with wrong values."""
-    changed: dict[str, Any] = {}
-    for name in message.__dataclass_fields__:
-        value = getattr(message, name)
-        if value is None or "covariance" in name:
-            continue
-        if name.startswith("xyz_"):
-            changed[name] = value + rng.normal(0, 3.0, 3)
-        elif name.startswith("velocity_"):
-            changed[name] = value + rng.normal(0, 2.0, 3)
-        elif name.startswith("R_"):
-            changed[name] = value @ exp_rotation(rng.normal(0, 0.4, 3))
-    return replace(message, **changed)
-
-
-def with_rotations(
-    flown: RecordedFlight, wrong_quarter: int = 0, after_s: float = 2.0, seed: int = 3
-) -> RecordedFlight:
-    """The same flight with RESOLVED rotations five times a second, as accurate as `align`'s in Manhattan."""
+def with_rotations(flown: RecordedFlight, after_s: float = 2.0, seed: int = 3) -> RecordedFlight:
+    """The same flight with rotations of one branch of four, five times a second, as accurate as `align`'s in Manhattan."""
     rng = np.random.default_rng(seed)
     first = flown.events[0][0]
     times = np.arange(after_s, (flown.truth_ns[-1] - first) * 1e-9 - 0.1, 0.2)
     off = gauss_markov(rng, math.radians(0.3), 1.0, 0.2, len(times))
+    branch = rotation_z(0.5 * math.pi * int(rng.integers(4)))
     more: list[Event] = []
-    quarter = exp_rotation(np.array([0.0, 0.0, wrong_quarter * math.pi / 2]))
     for t, e in zip(times, off, strict=True):
         stamp_ns = first + round(t * 1e9)
         true = flown.truth(stamp_ns)
         if true is None:
             continue
-        message = rotation(0.0, quarter @ true[0] @ exp_rotation(e), math.radians(0.3))
+        message = rotation(0.0, branch @ true[0] @ exp_rotation(e), math.radians(0.3))
         more.append((stamp_ns + 80_000_000, "rotation", replace(message, stamp_ns=stamp_ns)))
     events = [e for e in flown.events if not isinstance(e[2], RelativeRotation)] + more
     return replace(flown, events=sorted(events, key=lambda e: e[0]))
@@ -184,9 +124,12 @@ def with_rotations(
 
 
 @dataclass
-class Row(Errors):
-    """Result of a flight, or of several together."""
+class Row:
+    """Result of a flight, or of several together; errors of each pose with a position."""
 
+    error_m: list[float] = field(default_factory=list)
+    nees3: list[float] = field(default_factory=list)
+    angle_deg: list[float] = field(default_factory=list)  # of those with a rotation
     states: Counter[PoseState] = field(default_factory=Counter)
     longest_gap_s: float = 0.0
     wrong_quarter_full: int = 0  # poses with a rotation more than 45 deg off
@@ -198,6 +141,20 @@ class Row(Errors):
     def inside(self, rows: np.ndarray | None = None) -> float:
         nees = np.array(self.nees3) if rows is None else np.array(self.nees3)[rows]
         return 100 * float((nees <= CHI2_95_3).mean()) if len(nees) else math.nan
+
+
+def add_errors(row: Row, pose: RelativePose, R: np.ndarray, xyz_m: np.ndarray) -> None:
+    """Add the error of a pose with a position, and its NEES; its axes are the drone's where the rotation is known."""
+    estimate = pose.estimate
+    e = estimate.xyz_vehicle_m - xyz_m
+    row.error_m.append(float(np.linalg.norm(e)))
+    if isinstance(estimate, PoseEstimate):
+        e = estimate.R_vehicle_drone.T @ e
+        row.nees3.append(float(e @ np.linalg.solve(estimate.covariance[3:, 3:], e)))
+        turn = log_rotation(estimate.R_vehicle_drone.T @ R)
+        row.angle_deg.append(math.degrees(float(np.linalg.norm(turn))))
+    else:
+        row.nees3.append(float(e @ np.linalg.solve(estimate.covariance_vehicle_m2, e)))
 
 
 def judge(flown: RecordedFlight, poses: list[RelativePose], into: Row | None = None) -> Row:

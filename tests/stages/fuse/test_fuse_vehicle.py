@@ -9,23 +9,26 @@ import numpy as np
 import pytest
 
 from stages.fuse import Fuse
-from stages.fuse.motion_model import Motions
-from stages.fuse.settings import FuseErrors
+from stages.fuse.map_frame import MapFrame
 from stages.geometry.frames import rotation_z
 from stages.messages import PoseState, VehicleMotion
-from tests.stages.fuse.flown import late, outliers, without
-from tests.stages.fuse.made_drone_flight import Made, ns, rms
-from tests.stages.fuse.test_fuse_flight import wrong
+from tests.stages.fuse.fuse_inputs import late, outliers, without
+from tests.stages.fuse.imu_flights import ImuFlight, ns, seconds
+from tests.stages.fuse.judged import CHI2_95, VEHICLE, Flown, fly, rms
 
 FULL, COASTING = PoseState.FULL, PoseState.COASTING
-DRIVES = {"vehicle_mps": 6.0, "vehicle_dps": 4.0}
+END_S = 11.9
 
 
-def fused(made, fault):
-    stage, poses = Fuse(), []
-    for _, port, message in fault(made.events()):
-        poses += getattr(stage, f"on_{port}")(message)
-    return poses
+@pytest.fixture(scope="module")
+def driving():
+    """With cameras, so that the heading is known within 3 s."""
+    return ImuFlight(kind="fast", seed=3, until_s=12.0, vehicle_mps=6.0, rotations=True, images=True)
+
+
+@pytest.fixture(scope="module")
+def unharmed(driving):
+    return fly(driving, frame=VEHICLE)
 
 
 def drive(t, x=0.0, yaw=0.0):
@@ -34,75 +37,47 @@ def drive(t, x=0.0, yaw=0.0):
     )
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_20_percent_of_false_vehicle_poses_have_no_effect(seed):
-    made = Made(seed=seed, **DRIVES)
-    seen = made.judge(fused(made, outliers(("motion",), 0.2, seed)), after_s=4)
-    assert set(seen.states) == {FULL}
-    assert seen.rmse_m() < 0.15
-    assert max(seen.angle_deg) < 3
+def after(flown: Flown, from_s: float, until_s: float = math.inf):
+    """States of the poses between two times, and rows of their errors."""
+    states = {p.state for p in flown.poses if from_s < seconds(p.stamp_ns) < min(until_s, END_S)}
+    return states, np.array([from_s < t < until_s for t in flown.at_s])
 
 
-def test_after_missing_poses_a_false_one_is_still_rejected():
-    """Visual odometry has five poses per second: the gaps are long, but the possible motion in them is bounded."""
-    for off in (drive(1.6, x=2.0), drive(1.6, yaw=0.7)):
-        motions = Motions(FuseErrors(), parked=False)
-        for t in (0.2, 0.4, 0.6, 0.8, 1.0):
-            motions.add_vehicle_motion(drive(t))
-        motions.add_vehicle_motion(off)
-        np.testing.assert_allclose(motions.vehicle.at(ns(1.2))[1], (7.2, 0.0, 0.0), atol=1e-6)
-        motions.add_vehicle_motion(drive(1.65))
-        np.testing.assert_allclose(motions.vehicle.at(ns(1.65))[1], (9.9, 0.0, 0.0), atol=1e-6)
+def test_a_drone_over_a_driving_vehicle_is_full(unharmed):
+    states, rows = after(unharmed, 4.0)
+    assert states <= {FULL, COASTING}
+    assert rms(np.array(unharmed.error_m)[rows]) < 0.15
+    assert unharmed.wrong == 0
 
 
-def test_late_vehicle_motion_increases_the_covariance_but_not_the_error():
-    made = Made(until_s=15, **DRIVES)
-    on_time, behind = (made.judge(fused(made, late(("motion",), by_s)), after_s=4) for by_s in (0.0, 0.3))
-    assert np.mean(np.array(behind.nees3) < 7.81) > 0.9
-    assert rms(behind.sigma_m) > 1.5 * rms(on_time.sigma_m)
-    assert behind.rmse_m() < 0.5
+def test_20_percent_of_false_vehicle_poses_have_no_effect(driving, unharmed):
+    flown = fly(driving, fault=outliers(("motion",), 0.2), frame=VEHICLE)
+    states, rows = after(flown, 4.0)
+    assert states <= {FULL, COASTING}
+    assert rms(np.array(flown.error_m)[rows]) < rms(np.array(unharmed.error_m)[rows]) + 0.05
+    assert np.abs(flown.yaw_deg).max() < 5.0
 
 
-def test_missing_vehicle_motion_ends_full_until_it_returns():
-    made = Made(until_s=16, **DRIVES)
-    poses = fused(made, without(("motion",), 6.0, 9.0))
-    states = [(p.stamp_ns, p.state) for p in poses]
-    assert not any(state in (FULL, COASTING) for at, state in states if ns(6.8) < at < ns(8.9))
-    assert states[-1][1] is FULL
-    seen = made.judge(poses, after_s=4)
-    assert np.mean(np.array(seen.nees3) < 7.81) > 0.9
-    assert max(seen.error_m) < 2.0
+def test_late_vehicle_motion_increases_the_covariance_but_hardly_the_error(driving, unharmed):
+    flown = fly(driving, fault=late(("motion",), 0.3), frame=VEHICLE)
+    states, rows = after(flown, 4.0)
+    assert states <= {FULL, COASTING}
+    assert np.mean(np.array(flown.nees_position)[rows] < CHI2_95) > 0.9
+    assert rms(np.array(flown.sigma_m)[rows]) > 1.3 * rms(np.array(unharmed.sigma_m)[after(unharmed, 4.0)[1]])
+    assert rms(np.array(flown.error_m)[rows]) < 0.3
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_the_direction_over_ground_is_not_used_without_vehicle_motion(seed):
-    """Its camera measures the direction over ground; relative to a vehicle at 6 m/s it may be at rest."""
-    made = Made(until_s=11, seed=seed, images=True, vehicle_mps=6.0)
-    poses = fused(made, without(("motion",), 6.0, 10.0))
-    seen = made.judge([p for p in poses if ns(7.0) < p.stamp_ns < ns(9.9)])
-    assert len(seen.error_m) > 90
-    assert max(seen.error_m) < 0.5
-    assert np.mean(np.array(seen.nees3) < 7.81) > 0.9
+def test_missing_vehicle_motion_ends_full_until_it_returns(driving):
+    flown = fly(driving, fault=without(("motion",), 5.0, 7.0), frame=VEHICLE)
+    silent, rows = after(flown, 6.1, 6.9)
+    assert silent <= {PoseState.POSITION_ONLY, PoseState.AMBIGUOUS}
+    assert np.array(flown.error_m)[rows].max() < 1.0  # relative to the vehicle the position is still measured
+    assert FULL in after(flown, 11.0)[0]
+    assert flown.wrong == 0
 
 
-def test_one_jumping_pose_is_rejected_and_three_consistent_ones_are_a_new_map_frame():
-    motions = Motions(FuseErrors(), parked=False)
-    assert motions.add_vehicle_motion(drive(0.0))
-    assert not any(motions.add_vehicle_motion(drive(0.02 * i)) for i in range(1, 20))
-    assert not motions.add_vehicle_motion(drive(0.40, x=3.0))
-    assert not motions.add_vehicle_motion(drive(0.42))
-    assert motions.vehicle.at(ns(0.42))[1][0] == pytest.approx(6.0 * 0.42)
-    assert not motions.add_vehicle_motion(drive(0.44, x=3.0, yaw=0.5))
-    assert not motions.add_vehicle_motion(drive(0.46, x=3.0, yaw=0.5))
-    assert motions.add_vehicle_motion(drive(0.47, x=3.0, yaw=0.5))
-    assert not motions.add_vehicle_motion(drive(0.48, x=3.0, yaw=0.5))
-    R, t = motions.vehicle.at(ns(0.48))
-    assert t[0] == pytest.approx(6.0 * 0.48 + 3.0)
-    assert math.atan2(R[1, 0], R[0, 0]) == pytest.approx(0.5)
-
-
-def jumped(from_s, deg=115.0, hz=50, silent_s=0.0):
-    """Events with another map frame from a time on, optionally after a gap."""
+def jumped(from_s, deg=115.0):
+    """Events with another map frame from a time on."""
     R = rotation_z(math.radians(deg))
 
     def fault(events):
@@ -110,79 +85,86 @@ def jumped(from_s, deg=115.0, hz=50, silent_s=0.0):
             if port == "motion" and message.stamp_ns >= ns(from_s):
                 xyz_m = R @ message.xyz_map_m + np.array([200.0, 0.0, 0.0])
                 message = dataclasses.replace(message, xyz_map_m=xyz_m, R_map_vehicle=R @ message.R_map_vehicle)
-            left_out = round((message.stamp_ns - ns(0)) / 2e7) % (50 // hz) or ns(0) <= message.stamp_ns - round(
-                from_s * 1e9
-            ) < ns(silent_s)
-            if port != "motion" or not left_out:
-                yield at_ns, port, message
+            yield at_ns, port, message
 
     return fault
 
 
-@pytest.mark.parametrize(("hz", "silent_s"), [(50, 0.0), (5, 0.0), (50, 1.5)])
-@pytest.mark.parametrize("vehicle_mps", [0.0, 6.0, 15.0])
-def test_a_jump_of_the_map_frame_drops_the_rotation_but_not_the_position(vehicle_mps, hz, silent_s):
-    made = Made(until_s=13, vehicle_mps=vehicle_mps, vehicle_dps=4.0)
-    poses = fused(made, jumped(8.0, hz=hz, silent_s=silent_s))
-    assert not wrong(made, poses)
-    seen = made.judge([p for p in poses if p.xyz_vehicle_m is not None], after_s=5)
-    off, sigma = np.array(seen.error_m), np.array(seen.sigma_m)
-    assert np.mean(off > 0.5 + 3.0 * sigma) < 0.01
-    assert poses[-1].state is FULL
+@pytest.mark.parametrize("silent_s", [0.0, 1.5])
+def test_a_jump_of_the_map_frame_starts_anew(driving, silent_s):
+    """Relative to the vehicle no pose is wrong, in the new frame either."""
+    gap, jump = without(("motion",), 6.0, 6.0 + silent_s), jumped(6.0)
+    flown = fly(driving, fault=lambda events: jump(gap(events)), frame=VEHICLE)
+    off, sigma = np.array(flown.error_m), np.array(flown.sigma_m)
+    rows = after(flown, 1.0)[1]
+    assert np.mean((off > 0.5 + 3.0 * sigma)[rows]) < 0.01
+    assert np.abs(flown.yaw_deg).max() < 20.0
+    assert FULL in after(flown, 11.0)[0]
+    assert flown.poses[-1].resets > next(p.resets for p in flown.poses if p.state is FULL)
+    assert not any(p.state is FULL for p in flown.poses if 6.4 + silent_s < seconds(p.stamp_ns) < 6.6 + silent_s)
 
 
-@pytest.mark.parametrize("deg", [90.0, 180.0, 60.0])
-def test_a_jump_of_the_map_frame_while_the_drone_is_lost_drops_the_heading(deg):
-    made = Made(until_s=20, vehicle_mps=6.0, gaps_s={"fix": (5.0, 15.0), "rotation": (5.0, 30.0)})
-    poses = fused(made, jumped(14.0, deg))
-    assert any(p.state is PoseState.LOST for p in poses if p.stamp_ns > ns(13.0))
-    assert not wrong(made, poses)
+def test_odometry_in_large_map_coordinates_works(driving, unharmed):
+    far_m, stage = np.array([2e4, -5e4, 100.0]), Fuse()
+
+    def moved(events):
+        for at_ns, port, message in events:
+            if port == "motion":
+                message = dataclasses.replace(message, xyz_map_m=message.xyz_map_m + far_m)
+            yield at_ns, port, message
+
+    far = fly(driving, stage, moved, frame=VEHICLE)
+    assert stage.counters.totals == {}
+    assert rms(np.array(far.error_m)) == pytest.approx(rms(np.array(unharmed.error_m)), rel=0.05)
 
 
-def test_odometry_in_large_map_coordinates_works():
-    made, far_m = Made(until_s=10, **DRIVES), np.array([5e5, 5.2e6, 100.0])
-    stage, poses = Fuse(), []
-    for _, port, message in made.events():
-        if port == "motion":
-            message = dataclasses.replace(message, xyz_map_m=message.xyz_map_m + far_m)
-        poses += getattr(stage, f"on_{port}")(message)
-    assert stage.recoveries == 0
-    near, far = (made.judge(p, after_s=4) for p in (made.run(Fuse()), poses))
-    assert far.rmse_m() == pytest.approx(near.rmse_m(), rel=0.01)
+# the map frame by itself
+
+
+def filled(*motions):
+    frame = MapFrame(parked=False)
+    return frame, [frame.add(motion) for motion in motions]
+
+
+def test_one_jumping_pose_is_rejected_and_three_consistent_ones_are_a_new_map_frame():
+    frame, new = filled(*(drive(0.02 * i) for i in range(20)))
+    assert new == [True, *[False] * 19]  # before the first pose the map frame was the vehicle's
+    assert not frame.add(drive(0.40, x=3.0))
+    assert not frame.add(drive(0.42))
+    assert frame.vehicle.at(ns(0.42))[1][0] == pytest.approx(6.0 * 0.42)
+    assert [frame.add(drive(t, x=3.0, yaw=0.5)) for t in (0.44, 0.46, 0.47, 0.48)] == [False, False, True, False]
+    R, t = frame.vehicle.at(ns(0.48))
+    assert t[0] == pytest.approx(6.0 * 0.48 + 3.0)
+    assert math.atan2(R[1, 0], R[0, 0]) == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("off", [{"x": 2.0}, {"yaw": 0.7}])
+def test_after_missing_poses_a_false_one_is_still_rejected(off):
+    """Visual odometry has five poses per second: the gaps are long, but the possible motion in them is bounded."""
+    frame, _ = filled(*(drive(t) for t in (0.2, 0.4, 0.6, 0.8, 1.0)), drive(1.6, **off))
+    np.testing.assert_allclose(frame.vehicle.at(ns(1.2))[1], (7.2, 0.0, 0.0), atol=1e-6)
+    frame.add(drive(1.65))
+    np.testing.assert_allclose(frame.vehicle.at(ns(1.65))[1], (9.9, 0.0, 0.0), atol=1e-6)
+
+
+def test_the_map_frame_is_fixed_while_the_vehicle_s_motion_is_known_or_it_is_parked():
+    frame, _ = filled(drive(0.0))
+    assert frame.is_fixed(ns(0.6))
+    assert not frame.is_fixed(ns(0.8))
+    assert not MapFrame(parked=False).is_fixed(ns(0.0))
+    assert MapFrame(parked=True).is_fixed(ns(0.0))
 
 
 def test_beyond_its_newest_pose_a_vehicle_may_have_braked_and_turned():
     """a dt^2 / 2 each way, alpha dt^2 / 2 across; from 0.3 s on, where the trajectory ends, its whole displacement."""
-    motions, place = Motions(FuseErrors(), parked=False), np.array([3.0, 4.0, 12.0])
-    for i in range(5):
-        motions.add_vehicle_motion(drive(0.02 * i))
-    assert not motions.vehicle_covariance_m2(ns(0.06), place)[0].any()
+    frame, _ = filled(*(drive(0.02 * i) for i in range(5)))
+    place = np.array([3.0, 4.0, 12.0])
+    assert not frame.vehicle_covariance_m2(ns(0.06), place)[0].any()
     shift_m, yaw_rad = 0.5 * 2.0 * 0.2**2, 0.5 * 0.2 * 0.2**2
     across = np.array([-4.0, 3.0, 0.0])
-    covariance, yaw_rad2, lever = motions.vehicle_covariance_m2(ns(0.28), place)
+    covariance, yaw_rad2, lever = frame.vehicle_covariance_m2(ns(0.28), place)
     assert np.allclose(lever, across)
     assert yaw_rad2 == pytest.approx(yaw_rad**2)
     assert np.allclose(covariance, shift_m**2 * np.eye(3) + yaw_rad**2 * np.outer(across, across))
-    later, _, _ = motions.vehicle_covariance_m2(ns(0.48), place)
+    later, _, _ = frame.vehicle_covariance_m2(ns(0.48), place)
     assert math.sqrt(later[2, 2]) == pytest.approx(0.5 * 2.0 * 0.4**2 + 6.0 * 0.1)
-
-
-def test_late_visual_odometry_of_the_vehicle_keeps_full():
-    """Five times a second and 0.3 s late: its newest pose is up to half a second old."""
-    made = Made(until_s=15, **DRIVES)
-    rare = [e for e in made.events() if e[1] != "motion" or round((e[2].stamp_ns - ns(0)) / 2e7) % 10 == 0]
-    stage, poses = Fuse(), []
-    for _, port, message in late(("motion",), 0.3)(rare):
-        poses += getattr(stage, f"on_{port}")(message)
-    seen = made.judge(poses, after_s=5)
-    assert set(seen.states) <= {FULL, COASTING}
-    assert np.mean(np.array(seen.nees3) < 7.81) > 0.9
-
-
-def test_a_fix_waits_for_late_vehicle_motion_but_not_for_missing_one():
-    motions = Motions(FuseErrors(), parked=False)
-    motions.add_vehicle_motion(drive(0.0))
-    assert motions.must_wait(ns(0.3), ns(0.35))
-    assert not motions.must_wait(ns(0.15), ns(0.35))
-    assert not motions.must_wait(ns(0.3), ns(0.7))
-    assert not motions.must_wait(ns(0.75), ns(0.8))

@@ -81,7 +81,7 @@ def test_hypotheses_surround_the_circle_and_are_level():
     assert np.allclose(
         np.sort(np.remainder(bank.state.yaw_rad, 2 * math.pi)), 2 * math.pi / 12 * np.arange(12), atol=0.02
     )
-    assert bank.near_probability()[1] < 0.3
+    assert bank.yaws.best()[1] < 0.3
 
 
 def test_an_update_moves_towards_the_measurement_and_an_outlier_does_not():
@@ -107,7 +107,7 @@ def test_vanishing_points_leave_four_yaws_alike():
     bank.tidy()
     yaw = np.remainder(bank.state.yaw_rad - 0.3, 0.5 * math.pi)
     assert np.all(np.minimum(yaw, 0.5 * math.pi - yaw) < 0.05)
-    _, near = bank.near_probability()
+    _, near = bank.yaws.best()
     assert 0.2 < near < 0.35
 
 
@@ -116,7 +116,7 @@ def test_a_direction_of_flight_selects_the_yaw():
     true = rotation_z(2.0)
     for _ in range(6):
         measure.add_direction(bank, true.T @ np.array([1.0, 0.0, 0.0]), 0.05, 0.1)
-    best, near = bank.near_probability()
+    best, near = bank.yaws.best()
     assert abs(math.remainder(bank.state.yaw_rad[best] - 2.0, 2 * math.pi)) < 0.1
     assert near > 0.99
 

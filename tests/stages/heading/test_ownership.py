@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from stages.geometry.frames import rotation_z
+from stages.heading.inertial_bank import YawMixture
 from stages.heading.odometry_heading import OdometryHeading
 from stages.heading.ownership import Ownership, log_evidence
 
@@ -70,9 +71,21 @@ def test_the_yaw_by_odometry_is_that_of_the_frame_and_the_attitude():
 def test_evidence_never_exceeds_the_share_of_wrong_compasses():
     evidence = odometry_heading().evidence(round(2.4 * S), rotation_z(-0.3))
     assert evidence is not None
-    here, far = evidence.log_density(np.array([evidence.yaw_rad, evidence.yaw_rad + 2.0]), np.zeros(2))
-    assert math.isclose(far, math.log(0.03), rel_tol=1e-6)
-    assert here > far
+    sharp = YawMixture(np.array([evidence.yaw_rad, evidence.yaw_rad + 2.0]), np.full(2, 1e-6), np.full(2, 0.5))
+    after = evidence.applied(sharp)
+    here, far = after.weight[::2].sum(), after.weight[1::2].sum()
+    density = math.sqrt(2 * math.pi) / evidence.sigma_rad  # of the right yaw, relative to a uniform one
+    assert math.isclose(far / here, 0.03 / (0.97 * density + 0.03), rel_tol=1e-3)
+
+
+def test_evidence_narrows_a_yaw_that_is_not_known_and_keeps_the_wrong_compass_beside_it():
+    evidence = odometry_heading().evidence(round(2.4 * S), rotation_z(-0.3))
+    assert evidence is not None
+    wide = YawMixture(2 * math.pi / 12 * np.arange(12), np.full(12, math.radians(18.0) ** 2), np.full(12, 1 / 12))
+    after = evidence.applied(wide)
+    best, near = after.best()
+    assert abs(math.remainder(after.yaw_rad[best] - evidence.yaw_rad, 2 * math.pi)) < math.radians(5.0)
+    assert 0.93 < near < 0.999
 
 
 def test_a_drone_that_hardly_moves_gives_no_yaw_by_odometry():

@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
+import pytest
 
 from flow.message import check_arrays
 from stages.geometry.frames import rotation_z
 from stages.kernels.geometry.so3 import exp_rotation
-from stages.messages import DroneAttitude, DroneImu, DroneLocalPosition, DroneOdometry, DroneTilt
+from stages.messages import (
+    DroneAttitude,
+    DroneImu,
+    DroneLocalPosition,
+    DroneOdometry,
+    DroneTilt,
+    EarlierOdomFrame,
+    HeadingPrior,
+)
 from stages.odometry.drone import IndependentTelemetry
 
 MS = 1_000_000
@@ -84,3 +94,61 @@ def test_a_recent_gyro_sample_replaces_the_rate_of_an_estimate_that_is_not_indep
     stage.on_imu(imu(300 * MS))
     (tilt,) = stage.on_attitude(attitude(False))
     assert tilt.angular_velocity_drone_radps is None
+
+
+EARLIER = EarlierOdomFrame(
+    stamp_ns=-1_500 * MS, yaw_map_odom_rad=0.5, sigma_rad=math.radians(2.0), xyz_map_m=np.array([1.0, 2.0, 3.0])
+)
+
+
+def prior(stage: IndependentTelemetry, given: DroneAttitude) -> HeadingPrior | None:
+    found = [message for message in stage.on_attitude(given) if isinstance(message, HeadingPrior)]
+    return found[0] if found else None
+
+
+def own_position(stamp_ns: int) -> DroneLocalPosition:
+    return DroneLocalPosition(
+        stamp_ns=stamp_ns,
+        xyz_odom_m=np.array([4.0, 0.0, 10.0]),
+        velocity_odom_mps=np.array([0.0, 1.0, 0.0]),
+        independent=False,
+    )
+
+
+def test_after_a_restart_the_frame_of_the_earlier_run_gives_yaw_and_position():
+    stage = IndependentTelemetry()
+    stage.on_earlier(EARLIER)
+    assert stage.on_position(own_position(400 * MS)) is None
+    made = prior(stage, attitude(False, yaw_rad=0.3))
+    assert made is not None
+    assert made.yaw_map_rad == pytest.approx(0.8, abs=0.01)  # by a tilted drone
+    assert made.yaw_map_odom_rad == 0.5
+    c, s = math.cos(0.5), math.sin(0.5)
+    np.testing.assert_allclose(made.xyz_map_m, [1 + 4 * c - 0.1 * s, 2 + 4 * s + 0.1 * c, 13.0])
+    assert made.sigma_rad > EARLIER.sigma_rad
+    assert made.position_sigma_m == pytest.approx(math.hypot(0.5, 0.22), abs=0.01)  # 2 s
+
+
+def test_there_is_no_prior_without_an_earlier_run_or_a_recent_position():
+    stage = IndependentTelemetry()
+    stage.on_position(own_position(400 * MS))
+    assert prior(stage, attitude(False)) is None
+    stage.on_earlier(EARLIER)
+    stage.on_position(own_position(200 * MS))
+    assert prior(stage, attitude(False)) is None
+
+
+def test_a_prior_ends_with_its_age():
+    stage = IndependentTelemetry()
+    stage.on_earlier(dataclasses.replace(EARLIER, stamp_ns=-29_600 * MS))
+    stage.on_position(own_position(400 * MS))
+    assert prior(stage, attitude(False)) is None
+
+
+def test_after_a_reboot_of_the_autopilot_there_is_no_prior():
+    """Its estimate is independent then; a later pose of this run makes it dependent, but not of the earlier frame."""
+    stage = IndependentTelemetry()
+    stage.on_earlier(EARLIER)
+    stage.on_position(own_position(400 * MS))
+    assert prior(stage, attitude(True)) is None
+    assert prior(stage, attitude(False)) is None

@@ -246,6 +246,21 @@ def test_a_frozen_odometry_is_replaced_by_the_ego_motion_and_used_again_when_it_
             assert off(motion, np.eye(4))[0] < 0.3
 
 
+def test_an_odometry_that_was_frozen_keeps_its_frame_if_it_moved_on_during_the_freeze():
+    odometry = [frozen_at(t, 2.0) if t < 5 else pose(t) for t in seconds(0, 8, 0.02)]
+    out = published(VehicleMotionSelector(), odometry=odometry)
+    after = [m for m in out if m.stamp_ns > 5 * S]
+    assert len(after) > 140
+    assert max(off(m, np.eye(4))[0] for m in after) < 1e-9
+
+
+def test_an_odometry_that_missed_the_path_during_the_freeze_gets_a_new_frame():
+    missed = [dataclasses.replace(pose(t - 3.0), stamp_ns=round(t * S)) for t in seconds(5, 8, 0.02)]
+    out = published(VehicleMotionSelector(), odometry=[frozen_at(t, 2.0) for t in seconds(0, 5, 0.02)] + missed)
+    after = [m for m in out if m.stamp_ns > 5 * S]
+    assert np.linalg.norm(after[0].xyz_map_m - at(2.0)[:3, 3]) > 2.0, "extrapolated over a second at 3 m/s"
+
+
 def test_a_frozen_ego_motion_or_parked_vehicle_is_not_denied():
     still = [frozen_at(t, 0.0) for t in seconds(0, 20, 0.02)]
     assert all(m.status is MotionStatus.ACCEPTED for m in published(VehicleMotionSelector(), odometry=still))

@@ -85,7 +85,7 @@ def send_origin(vehicle: Vehicle, device_ns: int) -> None:
 
 def _command(vehicle: Vehicle, message: Any, device_ns: int) -> int:
     if message.command == SET_MESSAGE_INTERVAL:
-        return vehicle.streams.set_interval(int(message.param1), message.param2)
+        return vehicle.streams.set_interval(int(message.param1), message.param2, message.param3)
     if message.command == GET_MESSAGE_INTERVAL:
         return FAILED if vehicle.streams.interval_us(int(message.param1)) is None else ACCEPTED
     if message.command == REQUEST_MESSAGE:

@@ -12,6 +12,7 @@ init_ekf_xy_reset), ModeGuided; the plan and its speed profile are ours.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -57,9 +58,10 @@ class FlightTarget:
 class Guidance:
     """The plan, step by step, as targets."""
 
-    def __init__(self, path: Path, vehicle: Path, target: FlightTarget) -> None:
+    def __init__(self, path: Path, vehicle: Path, target: FlightTarget, drift_m: Callable[[float], Array64]) -> None:
+        """`drift_m`: error of the position of the vehicle that it follows, at a time (3,)."""
         self.target = target
-        self._path, self._vehicle = path, vehicle
+        self._path, self._vehicle, self._drift_m = path, vehicle, drift_m
         self._step: PlanStep | None = None
         self._begin_s = 0.0
         self._from = target.xyz_m.copy()
@@ -122,8 +124,11 @@ class Guidance:
     def _follow(self, time_s: float, frame: SurveyFrame) -> None:
         times = np.array([self._begin_s, time_s])
         position, velocity, _, _ = self._vehicle.at(times)
-        self.target.xyz_m = self._from + rotate(position[1] - position[0], frame.yaw_rad)
-        self.target.velocity_mps = rotate(velocity[1], frame.yaw_rad)
+        drift = self._drift_m(time_s)
+        moved = position[1] - position[0] + drift - self._drift_m(self._begin_s)
+        drifting = (drift - self._drift_m(time_s - TICK_S)) / TICK_S
+        self.target.xyz_m = self._from + rotate(moved, frame.yaw_rad)
+        self.target.velocity_mps = rotate(velocity[1] + drifting, frame.yaw_rad)
 
 
 class PositionController:

@@ -1,9 +1,7 @@
 """What became of a flight: crash, failsafe, errors of the sent poses, scatter of the hover. For statistics only.
 
 A flight is lost when it crashes (ground or an obstacle), when the EKF failsafe lands it, or when it leaves its plan by
-more than 20 m. Errors of a sent pose are those of ODOMETRY against T_map_vehicle T_vehicle_drone at its time: the first
-by the vehicle's odometry, whose drift the autopilot's frame shares, the second true. Without odometry both are true.
-A position that is sent without yaw is compared in axes that point to the true north.
+more than 20 m.
 
 Source: ours.
 """
@@ -14,22 +12,18 @@ import json
 import math
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flow.link import Record
-from links.mavlink.ned_frd import R_odom_drone_from_wxyz, flip_yz
-from links.mavlink.transport.framing import parse_frame
+from links.simulated.autopilot.flight_stack.sent_poses import SentPoses
 from links.simulated.autopilot.flight_stack.stack import FlightStack
 from links.simulated.kernels.motion import STEP_S
+from links.simulated.sensors.vehicle_odometry import VehicleOdometry
 from links.simulated.world.mesh import RayScene
 from links.simulated.world.scene import Truth
-from stages.geometry.frames import Array64, rotation_z, rotations_from_xyzw
+from stages.geometry.frames import Array64
 
-WRONG_M, WRONG_DEG = 1.0, 10.0  # a sent pose with a larger error is wrong
-NO_YAW_RAD2 = 9.0  # a larger yaw variance: the message holds no yaw
 SETTLE_S = 3.0  # of a hold, before its scatter counts
 FLYAWAY_M = 20.0
 
@@ -47,6 +41,10 @@ class Outcome:
     sent_95_m: float | None
     sent_yaw_worst_deg: float | None
     sent_yaw_rms_deg: float | None
+    inside_share: float | None  # positions inside the 95 % ellipsoid of their message
+    yaw_inside_share: float | None  # the same of yaws
+    heading_s: float | None  # from the first position to the first pose with a rotation, since the last start of grd
+    longest_gap_s: float | None  # without a sent pose, from the first one until the flight was lost
     hover_scatter_m: float | None  # 3D RMS about the mean position, worst hold after the switch to external poses
     estimate_worst_m: float | None  # the furthest that the drone was from its target in the plan's frame
     events: list[tuple[float, str]] = field(default_factory=list[tuple[float, str]])
@@ -63,6 +61,7 @@ class Outcome:
             )
             if self.sent_yaw_rms_deg is not None:
                 parts.append(f"yaw worst {self.sent_yaw_worst_deg:.1f} deg, RMS {self.sent_yaw_rms_deg:.1f} deg")
+            parts.append(f"longest gap {self.longest_gap_s:.1f} s")
         else:
             parts.append("no pose sent")
         if self.hover_scatter_m is not None:
@@ -77,28 +76,17 @@ class Outcome:
 class FlightOutcome:
     """Watches a flight: call `update` as it is flown and `on_sent` for each frame to the autopilot."""
 
-    def __init__(self, stack: FlightStack, world: RayScene, truth: Truth) -> None:
+    def __init__(
+        self, stack: FlightStack, world: RayScene, truth: Truth, odometry: VehicleOdometry | None = None
+    ) -> None:
         self._stack, self._world, self._truth = stack, world, truth
-        self._row = 0
         self._lost_s: float | None = None
         self._last: Array64 | None = None
-        # stamp [ns], position [m], yaw in map [rad]; NaN: without yaw, and the position in north-aligned axes
-        self._poses: list[tuple[int, Array64, float]] = []
-        self._odometry: list[tuple[int, list[float], list[float]]] = []  # stamp [ns], position, quaternion xyzw
-
-    def on_odometry(self, record: Record) -> None:
-        """A pose by the vehicle's odometry."""
-        pose = json.loads(record.data)
-        self._odometry.append((record.stamp_ns, pose["xyz_m"], pose["quaternion_xyzw"]))
+        self._poses = SentPoses(truth, odometry, stack.north_yaw_of_map)
 
     def on_sent(self, record: Record) -> None:
         """A frame to the autopilot."""
-        message: Any = parse_frame(record.data)
-        if message.get_type() == "ODOMETRY":
-            xyz = flip_yz(np.array([message.x, message.y, message.z]))
-            has_yaw = all(map(math.isfinite, message.q)) and not message.pose_covariance[20] > NO_YAW_RAD2
-            R = R_odom_drone_from_wxyz(message.q) if has_yaw else np.full((3, 3), np.nan)
-            self._poses.append((int(message.time_usec) * 1000, xyz, math.atan2(R[1, 0], R[0, 0])))
+        self._poses.add(record)
 
     def is_over(self) -> bool:
         """Check the path since the last call for collisions and fly-aways; True: the flight was lost some time ago."""
@@ -118,67 +106,34 @@ class FlightOutcome:
         first_s = min(failed_s, math.inf if self._lost_s is None else self._lost_s)
         return wait_s is not None and self._stack.motion.until_s > first_s + wait_s
 
-    def result(self) -> Outcome:
-        """The outcome so far."""
+    def result(self, heading_s: float | None = None) -> Outcome:
+        """The outcome so far; heading_s: see Outcome."""
         events = self._stack.events
         failsafe = next((time_s for time_s, what in events if what == "EKF failsafe"), None)
-        lost = [t for t in (self._lost_s, failsafe) if t is not None]
-        position_m, yaw_deg = self._sent_errors()
-        wrong = position_m > WRONG_M
-        wrong[self._with_yaw()] |= yaw_deg > WRONG_DEG
-        sent = len(position_m)
+        lost_s = min([t for t in (self._lost_s, failsafe) if t is not None], default=None)
+        end_s = self._stack.motion.until_s if lost_s is None else lost_s
+        until_ns = self._truth.start_ns + round(self._stack.motion.until_s * 1e9)
+        errors = self._poses.errors(until_ns)
+        position_m, yaw_deg = errors.position_m, errors.yaw_deg
+        sent, with_yaw = len(position_m) > 0, len(yaw_deg) > 0
         return Outcome(
             crashed=self._stack.quadrotor.crashed,
             failsafe_s=failsafe,
-            lost_s=min(lost) if lost else None,
-            sent_poses=sent,
-            wrong_poses=int(wrong.sum()),
+            lost_s=lost_s,
+            sent_poses=len(position_m),
+            wrong_poses=int(errors.wrong.sum()),
             sent_worst_m=round(float(position_m.max()), 3) if sent else None,
             sent_95_m=round(float(np.percentile(position_m, 95)), 3) if sent else None,
-            sent_yaw_worst_deg=round(float(yaw_deg.max()), 2) if len(yaw_deg) else None,
-            sent_yaw_rms_deg=round(float(np.sqrt(np.mean(yaw_deg**2))), 2) if len(yaw_deg) else None,
+            sent_yaw_worst_deg=round(float(yaw_deg.max()), 2) if with_yaw else None,
+            sent_yaw_rms_deg=round(float(np.sqrt(np.mean(yaw_deg**2))), 2) if with_yaw else None,
+            inside_share=round(float(errors.inside.mean()), 4) if sent else None,
+            yaw_inside_share=round(float(errors.yaw_inside.mean()), 4) if with_yaw else None,
+            heading_s=None if heading_s is None else round(heading_s, 2),
+            longest_gap_s=self._poses.longest_gap_s(self._truth.start_ns + round(end_s * 1e9)),
             hover_scatter_m=self._hover_scatter(),
             estimate_worst_m=round(self._stack.worst_target_error_m, 2),
             events=list(events),
         )
-
-    def _with_yaw(self) -> NDArray[np.bool_]:
-        return np.array([not math.isnan(yaw) for _, _, yaw in self._poses], dtype=bool)
-
-    def _sent_errors(self) -> tuple[Array64, Array64]:
-        """Position errors [m] of all sent poses, in map, and yaw errors [deg] of those with yaw."""
-        if not self._poses:
-            return np.empty(0), np.empty(0)
-        latest = self._truth.start_ns + round(self._stack.motion.until_s * 1e9)
-        stamps = np.minimum(np.array([stamp for stamp, _, _ in self._poses], dtype=np.int64), latest)
-        R_vehicle, t_vehicle = self._truth.T_world_vehicle(stamps)
-        R_drone, t_drone = self._truth.T_world_drone(stamps)
-        relative_m = np.einsum("nji,nj->ni", R_vehicle, t_drone - t_vehicle)
-        R_relative = np.swapaxes(R_vehicle, 1, 2) @ R_drone
-        R_map, t_map = self._map_vehicle(stamps)
-        expected_m = t_map + np.einsum("nij,nj->ni", R_map, relative_m)
-        R_expected = R_map @ R_relative
-        yaw = np.arctan2(R_expected[:, 1, 0], R_expected[:, 0, 0])
-        sent_m = np.array([xyz for _, xyz, _ in self._poses])
-        sent_yaw = np.array([yaw for _, _, yaw in self._poses])
-        without = np.isnan(sent_yaw)
-        expected_m[without] = expected_m[without] @ rotation_z(self._stack.north_yaw_of_map).T
-        error = np.degrees(sent_yaw[~without] - yaw[~without])
-        return np.linalg.norm(sent_m - expected_m, axis=1), np.abs((error + 180) % 360 - 180)
-
-    def _map_vehicle(self, stamps: NDArray[np.int64]) -> tuple[Array64, Array64]:
-        """T_map_vehicle at times (n,) by the vehicle's odometry, interpolated; without it, the true one."""
-        if len(self._odometry) < 2:
-            R0, t0 = (part[0] for part in self._truth.T_world_vehicle(np.array([self._truth.start_ns])))
-            R, t = self._truth.T_world_vehicle(stamps)
-            return R0.T @ R, (t - t0) @ R0
-        at_s = [(stamp - self._truth.start_ns) * 1e-9 for stamp, _, _ in self._odometry]
-        rows = np.array([[*xyz, *quaternion] for _, xyz, quaternion in self._odometry])
-        rows[:, 3:] *= np.sign(rows[:, 3:] @ rows[0, 3:])[:, None]
-        now_s = (stamps - self._truth.start_ns) * 1e-9
-        values = np.column_stack([np.interp(now_s, at_s, rows[:, i]) for i in range(7)])
-        values[:, 3:] /= np.linalg.norm(values[:, 3:], axis=1, keepdims=True)
-        return rotations_from_xyzw(values[:, 3:]), values[:, :3]
 
     def _hover_scatter(self) -> float | None:
         """Worst 3D RMS of the position about its mean, over the holds after the switch."""

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -61,12 +62,13 @@ class FlightStack:
         start_ns: int,
         duration_s: float,
         seed: int,
+        drift_m: Callable[[float], Array64] | None = None,
     ) -> None:
+        """`drift_m`: error of the vehicle's odometry at a time, world axes (3,): of the frame of external positions."""
         assert settings.flight_stack is not None
         s = self.settings = settings.flight_stack
         self._autopilot, self._start_ns = settings, start_ns
         self.own, self.px4 = (1, 1), s.kind == "px4"
-        required = required_parameters(s.kind, "none")
         fuses_yaw = any(SOURCE_SETS[name].yaw is AidingSource.EXTERNAL for name in s.source_sets[1:])
         required = required_parameters(s.kind, "measured" if fuses_yaw else "none")
         self.parameters: dict[str, float] = {parameter.name: parameter.best for parameter in required}
@@ -83,8 +85,9 @@ class FlightStack:
         self.quadrotor = Quadrotor(s, home, float(yaw), ground_m, duration_s, seed)
         self.motion = self.quadrotor.motion
         self._sensors = Sensors(s, seed)
-        self.ekf = Estimators(s, self._true_yaw() + self._sensors.yaw_bias_rad, self.quadrotor, seed)
-        self._guidance = Guidance(path, vehicle, FlightTarget(np.zeros(3), yaw_rad=self._true_yaw()))
+        self.ekf = Estimators(s, self._true_yaw() + self._sensors.yaw_bias_rad, seed)
+        self._drift_m = drift_m or (lambda time_s: np.zeros(3))
+        self._guidance = Guidance(path, vehicle, FlightTarget(np.zeros(3), yaw_rad=self._true_yaw()), self._drift_m)
         self._controller, self._check = PositionController(), EkfCheck()
         self.armed, self.mode = not s.on_ground, GUIDED
         self._plan: deque[Any] = deque(s.plan)
@@ -216,6 +219,8 @@ class FlightStack:
         frame = self._frame()
         if time_s > self._switched_s + 1.0:  # until the estimate is reset, the target is in the frame of before
             away = rotate(target.xyz_m - frame.xyz_m, -frame.yaw_rad) - self.quadrotor.state[0:3]
+            if self.ekf.sources.position is AidingSource.EXTERNAL:
+                away -= self._drift_m(time_s)
             self.target_error_m = float(np.linalg.norm(away))
         self.worst_target_error_m = max(self.worst_target_error_m, self.target_error_m)
         return self._controller.command(target, estimate[0:3], estimate[3:6])

@@ -4,7 +4,8 @@ ArduPilot keeps intervals in whole milliseconds (the request is truncated), deni
 period, and lowers the rates of a slow port. Its scheduler sends at multiples of its loop.
 
 Source: ArduPilot GCS_Common.cpp (set_message_interval, cap_message_interval), https://mavlink.io/en/messages/
-common.html#MAV_CMD_SET_MESSAGE_INTERVAL; PX4 mavlink_main.cpp (configure_stream).
+common.html#MAV_CMD_SET_MESSAGE_INTERVAL, https://github.com/ArduPilot/ardupilot/pull/28019 (third parameter); PX4
+mavlink_main.cpp (configure_stream).
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ ACCEPTED, TEMPORARILY_REJECTED, DENIED, UNSUPPORTED, FAILED = 0, 1, 2, 3, 4  # M
 HEARTBEAT, SYS_STATUS, ATTITUDE, LOCAL_POSITION_NED, ODOMETRY = 0, 1, 30, 32, 331
 RAW_IMU, SCALED_IMU, HIGHRES_IMU, EKF_STATUS_REPORT, ESTIMATOR_STATUS = 27, 26, 105, 193, 230
 NS = 1_000_000_000
+EARLY = 0.9  # a message of a plan passes after this share of its interval: plan and interval beat otherwise
 
 KNOWN = {
     "ardupilot": (HEARTBEAT, ATTITUDE, LOCAL_POSITION_NED, ODOMETRY, RAW_IMU, SCALED_IMU, EKF_STATUS_REPORT),
@@ -31,6 +33,19 @@ class Streams:
         self._default = {message: rates_hz.get(message, 0.0) for message in KNOWN[kind]}
         self._interval_ns = {m: round(NS / hz) if hz else 0 for m, hz in self._default.items()}
         self._next_ns: dict[int, int] = {}
+        self.requested: set[int] = set()
+        """Messages whose interval a station has set."""
+        self._passed_ns: dict[int, int] = {}
+
+    def passes(self, message: int, device_ns: int) -> bool:
+        """Whether a message that a plan sends at other times is sent now; True without a request."""
+        interval_ns = self._interval_ns.get(message, 0)
+        if message not in self.requested:
+            return True
+        if not interval_ns or device_ns - self._passed_ns.get(message, -interval_ns) < EARLY * interval_ns:
+            return False
+        self._passed_ns[message] = device_ns
+        return True
 
     def due(self, device_ns: int) -> list[int]:
         """Messages to send at this step of the main loop, by id."""
@@ -48,8 +63,10 @@ class Streams:
                 found.append(message)
         return found
 
-    def set_interval(self, message: int, interval_us: float) -> int:
-        """MAV_CMD_SET_MESSAGE_INTERVAL; returns the MAV_RESULT of its ACK."""
+    def set_interval(self, message: int, interval_us: float, third: float = 0.0) -> int:
+        """MAV_CMD_SET_MESSAGE_INTERVAL with its three parameters; returns the MAV_RESULT of its ACK."""
+        if third and self._kind == "ardupilot":
+            return DENIED
         if message not in self._interval_ns:
             return FAILED if self._kind == "ardupilot" else DENIED
         if message in self._denied:
@@ -67,6 +84,7 @@ class Streams:
                     return DENIED
         self._interval_ns[message] = interval_ns
         self._next_ns.pop(message, None)
+        (self.requested.discard if interval_us == 0 else self.requested.add)(message)
         return ACCEPTED
 
     def interval_us(self, message: int) -> int | None:
@@ -80,3 +98,4 @@ class Streams:
         """After a reboot: the rates of the start again."""
         self._interval_ns = {m: round(NS / hz) if hz else 0 for m, hz in self._default.items()}
         self._next_ns.clear()
+        self.requested.clear()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from typing import Any
 
@@ -10,6 +11,7 @@ import pytest
 from links.mavlink.poses.gate import PoseLimits, RejectReason
 from links.mavlink.poses.pose_sender import PoseSender
 from links.mavlink.poses.status_texts import TEXT_BYTES, fitted
+from links.mavlink.profiles import YawOutput
 from stages.messages import PoseState
 from tests.links.mavlink.mavlink_poses import HOST0, MS, good_pose
 
@@ -185,3 +187,13 @@ def test_each_reason_for_stopping_fits_the_field(reason: RejectReason):
 def test_a_text_ends_at_a_word_within_its_field(text: str, sent: bytes):
     assert fitted(text) == sent
     assert len(sent) <= TEXT_BYTES
+
+
+@pytest.mark.parametrize(("yaw", "severity"), [("none", 6), ("measured", 4)])
+def test_a_position_alone_is_a_warning_only_if_poses_with_yaw_are_sent(yaw: YawOutput, severity: int):
+    pose_sender = PoseSender(("odometry",), PoseLimits(), yaw=yaw)
+    for i in range(75):
+        pose = dataclasses.replace(good_pose(HOST0 + 20 * i * MS), state=PoseState.POSITION_ONLY, reason="by LiDAR")
+        pose_sender.messages(pose, HOST0 + 20 * i * MS)
+    (text,) = pose_sender.due_texts(HOST0 + 1500 * MS)
+    assert (text.severity, text.text) == (severity, "grd: POSITION_ONLY: by LiDAR")

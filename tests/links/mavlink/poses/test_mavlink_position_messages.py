@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega
 
+from links.mavlink.poses.autopilot_estimate import AutopilotAttitude
 from links.mavlink.poses.gate import PoseLimits, RejectReason
 from links.mavlink.poses.pose_sender import PoseMessage, PoseSender
-from links.mavlink.poses.position_messages import OwnAttitude
 from links.mavlink.profiles import ProfileName
 from links.mavlink.transport.framing import packed, parse_frame
 from stages.messages import PoseState
@@ -25,7 +25,7 @@ def sender(
 ) -> PoseSender:
     pose_sender = PoseSender(kinds, PoseLimits(), yaw="none", profile=profile)
     if attitude:
-        pose_sender.on_attitude(OwnAttitude(0.1, 0.2, 2.0, HOST0))
+        pose_sender.autopilot.attitude = AutopilotAttitude(0.1, 0.2, 2.0, HOST0)
     return pose_sender
 
 

@@ -7,12 +7,17 @@ import threading
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega
 
+from flow.link import Record
 from links.clock import host_time
 from links.mavlink import Autopilot
 from links.mavlink.poses.sent_state import SentState
+from links.mavlink.transport.framing import packed, parse_frame
+from stages.geometry.frames import rotation_z
+from stages.messages import DroneAttitude, EarlierOdomFrame
 from tests.links.mavlink.mavlink_poses import good_pose
 from tests.links.mavlink.test_mavlink_live import Listener, listening
 
@@ -23,14 +28,14 @@ S = 1_000_000_000
 def test_the_newest_pose_is_kept(tmp_path: Path):
     file = tmp_path / "new" / "sent.json"
     state = SentState(file, 5 * S)
-    assert state.earlier is None
+    assert state.take_earlier() is None
     state.write()
     assert not file.exists()  # nothing was sent
     for i in range(4):
         state.on_sent(bytes([i]), (5 + i) * S)
         state.write()
-    assert SentState(file, 10 * S).earlier == (8 * S, b"\x03")
-    assert SentState(file, 7 * S).earlier == (7 * S, b"\x03")  # not from the future
+    assert SentState(file, 10 * S).take_earlier() == (8 * S, b"\x03", None)
+    assert SentState(file, 7 * S).take_earlier() == (7 * S, b"\x03", None)  # not from the future
 
 
 def test_it_is_written_once_a_second(tmp_path: Path):
@@ -38,15 +43,17 @@ def test_it_is_written_once_a_second(tmp_path: Path):
     for i in range(1, 100):
         state.on_sent(bytes([i]), i * S // 50)
         state.write()
-    assert SentState(tmp_path / "sent.json", 10 * S).earlier == (51 * S // 50, bytes([51]))
+    assert SentState(tmp_path / "sent.json", 10 * S).take_earlier() == (51 * S // 50, bytes([51]), None)
 
 
 def test_a_damaged_file_counts_as_a_pose_sent_now_and_is_reported(tmp_path: Path):
     file = tmp_path / "sent.json"
     file.write_text("{")
     state = SentState(file, 5 * S)
-    assert state.earlier is not None
-    assert state.earlier[0] == 5 * S
+    earlier = state.take_earlier()
+    assert earlier is not None
+    assert earlier[0] == 5 * S
+    assert state.take_earlier() is None
     assert "delete it" in (state.status or "")
 
 
@@ -71,12 +78,17 @@ class Drone:
             for _ in range(count):
                 boot_ms = (host_time.now_ns() - self._booted_ns) // 1_000_000
                 message = mavlink.MAVLink_attitude_message(boot_ms, 0.1, 0.2, 0.3, 0.0, 0.0, 0.0)
-                udp.sendto(bytes(message.pack(self._mav)), ("127.0.0.1", listener.link.port))
-                self._mav.seq = (self._mav.seq + 1) % 256
+                position = mavlink.MAVLink_local_position_ned_message(boot_ms, 4, 2, -30, 0, 0, 0)
+                for each in (position, message):
+                    udp.sendto(packed(each, self._mav), ("127.0.0.1", listener.link.port))
                 pause.wait(0.01)
                 if poses:
-                    listener.link.on_pose(good_pose(host_time.now_ns()))
-        listener.wait(lambda: len(listener.messages) >= before + count)
+                    learnt_before_the_switch_rad = -1.0
+                    pose = good_pose(
+                        host_time.now_ns(), R_map_drone=rotation_z(0.5), odom_yaw_rad=learnt_before_the_switch_rad
+                    )
+                    listener.link.on_pose(pose)
+        listener.wait(lambda: len(listener.messages) >= before + 2 * count)
 
 
 @pytest.mark.parametrize(("rebooted", "independent"), [(False, False), (True, True)])
@@ -93,8 +105,51 @@ def test_after_a_restart_the_estimate_is_independent_only_if_the_autopilot_has_r
         drone.send(listener, 10, poses=False)
         listener.link.on_pose(good_pose(0))  # too old: not sent
         sent = list(listener.link.sent())
-    live = [message.independent for message in listener.messages if message is not None]
+    live = [message.independent for message in listener.messages if isinstance(message, DroneAttitude)]
     assert live == [independent] * 10
     replayed = Autopilot()
     messages = [replayed.decode(r) for r in sorted([*listener.records, *sent], key=lambda r: r.arrival_ns)]
-    assert [message.independent for message in messages if message is not None] == live
+    assert [message.independent for message in messages if isinstance(message, DroneAttitude)] == live
+
+
+def test_the_frame_of_the_autopilot_is_known_after_a_restart_live_and_in_replay(tmp_path: Path):
+    """The body's yaw is 0.5 in `map` and -0.3 by the autopilot; it is at (101, 2, 10) in `map` and at (4, -2, 30)."""
+    state_file, drone = str(tmp_path / "sent.json"), Drone(uptime_s=60.0)
+    with listening(state_file=state_file) as listener:
+        assert not [m for m in listener.messages if isinstance(m, EarlierOdomFrame)]
+        drone.send(listener, 30, poses=True)
+    with listening(state_file=state_file) as listener:
+        drone.send(listener, 10, poses=False)
+    found = [message for message in listener.messages if isinstance(message, EarlierOdomFrame)]
+    assert len(found) == 1
+    yaw_rad = found[0].yaw_map_odom_rad
+    assert yaw_rad == pytest.approx(0.8, abs=0.02)
+    np.testing.assert_allclose(found[0].xyz_map_m + rotation_z(yaw_rad) @ [4, -2, 30], [101, 2, 10], atol=0.1)
+    assert found[0].sigma_rad == pytest.approx(0.02, abs=0.002)
+    texts = [parse_frame(r.data).text for r in listener.link.sent() if parse_frame(r.data).get_type() == "STATUSTEXT"]
+    assert "grd: restarted 0 s after its last pose" in texts
+    replayed = Autopilot()
+    messages = [replayed.decode(record) for record in listener.records]
+    again = [message for message in messages if isinstance(message, EarlierOdomFrame)]
+    assert [(m.stamp_ns, m.yaw_map_odom_rad) for m in again] == [(found[0].stamp_ns, yaw_rad)]
+
+
+def test_a_link_that_is_reopened_does_not_report_its_own_run(tmp_path: Path):
+    drone = Drone(uptime_s=60.0)
+    with listening(state_file=str(tmp_path / "sent.json")) as listener:
+        drone.send(listener, 30, poses=True)
+        link = listener.link
+    with link.listen() as records:
+        again = Listener(link, records)
+        drone.send(again, 10, poses=False)
+    again.thread.join(5)
+    assert len(again.messages) >= 10
+    assert not any(isinstance(message, EarlierOdomFrame) for message in again.messages)
+    assert not any(m.independent for m in again.messages if isinstance(m, DroneAttitude))
+
+
+def test_an_echo_of_our_own_frames_is_no_earlier_run():
+    link, mav = Autopilot(), mavlink.MAVLink(None, srcSystem=1, srcComponent=197)
+    heartbeat = bytes(mavlink.MAVLink_heartbeat_message(18, 8, 0, 0, 3, 3).pack(mav))
+    assert link.decode(Record("/autopilot/rx", 0, 0, heartbeat)) is None
+    assert link.counters.rejected["echo of our own"] == 1

@@ -17,6 +17,7 @@ from links.mavlink.origin import OriginSender
 from links.mavlink.poses.gate import PoseLimits
 from links.mavlink.poses.independence import Independence
 from links.mavlink.poses.pose_sender import PoseSender
+from links.mavlink.source_switch import SourceSwitch
 from links.mavlink.streams.message_intervals import MessageIntervals, MessageRates
 from links.mavlink.transport.connection import Address, Connection
 from links.mavlink.transport.framing import packed, parse_frame
@@ -108,7 +109,7 @@ class RatedBridge:
     """A bridge behind a fast line: accepts every datagram."""
 
     datagrams, status = True, None
-    reconnects = foreign = stalls = left_late = 0
+    reconnects = foreign = stalls = late_frames = 0
 
     def __init__(self, line: RatedLine) -> None:
         self.line = line
@@ -151,6 +152,7 @@ class SlowFlight:
             pose_sender,
             OriginSender(None, (1, 1)),
             MessageIntervals(NO_REQUESTS, "ardupilot", (1, 1), (1, 197)),
+            SourceSwitch(None, (), (1, 1), (1, 197), pose_sender.texts.warn, 0.35),
             None,
             lambda: self.now_ns,
             ("/autopilot/rx", "/autopilot/tx"),

@@ -21,7 +21,7 @@ import pytest
 from flow.link import LinkError
 from links.mavlink.transport.connection import Connection, Endpoint, Udp, parse_connection
 from links.mavlink.transport.serial_line import SERIAL_BACKLOG_BYTES
-from links.mavlink.transport.stream_connection import STALL_S, StreamConnection, open_connection
+from links.mavlink.transport.stream_connection import MAX_STALL_S, StreamConnection, open_connection
 from links.mavlink.transport.tcp_line import TCP_BACKLOG_BYTES
 
 FRAME = bytes(244)
@@ -317,7 +317,7 @@ def test_a_blocked_line_is_closed_with_a_status_and_a_slow_one_is_not(capacity: 
     line.capacity = capacity
     assert link.send(b"BBBB")
     line.buffered = 4 if capacity == 4 else 0
-    now_s += STALL_S + 0.01
+    now_s += MAX_STALL_S + 0.01
     link.receive(0.0)
     assert link.stalls == 1
     assert "did not transmit within 0.5 s" in (link.status or "")

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from links.mavlink.timesync_monitor import LATE_NS
+from links.mavlink.timesync_monitor import MAX_LATENCY_NS
 from tests.links.mavlink.transport.mavlink_bridges import SlowFlight
 
-LATE_S = 1e-9 * LATE_NS
+LATE_S = 1e-9 * MAX_LATENCY_NS
 
 
 def stale(flight: SlowFlight) -> int:

@@ -198,7 +198,7 @@ def test_a_calibrated_rig_file_has_encoder_error_and_backlash_and_the_world_is_u
     assert np.abs(plain.rig.mount.turntable_rad(encoder) - truly).max() > np.radians(0.1)
     sensed = [[(r.topic, r.data) for r in Simulation(s.changed(duration_s=0.2)).records()] for s in (plain, known)]
     assert sensed[0] == sensed[1]
-    assert Scenario.model_validate(yaml.safe_load(known.as_yaml())) == known
+    assert Scenario.model_validate(yaml.safe_load(known.as_yaml())).as_yaml() == known.as_yaml()
 
 
 def test_odometry_and_rain_are_added_to_a_cell_and_change_nothing_else() -> None:
@@ -235,7 +235,7 @@ def test_a_perturbed_rig_differs_from_its_file_and_its_drone_is_one_of_several()
     perturbed = [scenario_of(cell, seed, conditions) for seed in range(1, 60)]
     third = perturbed[2]
     assert third.rig == ideal.rig
-    assert Scenario.model_validate(yaml.safe_load(third.as_yaml())) == third
+    assert Scenario.model_validate(yaml.safe_load(third.as_yaml())).as_yaml() == third.as_yaml()
     zero_deg = [s.mount.servo_zero_deg for s in perturbed]
     tilt_deg = [np.degrees(np.arccos(s.mount.T_vehicle_turntable.matrix()[2, 2])) for s in perturbed]
     assert 0.07 < np.std(zero_deg) < 0.13
@@ -278,7 +278,7 @@ def test_a_seed_determines_the_scenario() -> None:
 
 def test_a_scenario_is_unchanged_by_its_yaml() -> None:
     scenario = scenario_of(Cell("atlanta", 10, "orbit", "turning"), 4)
-    assert Scenario.model_validate(yaml.safe_load(scenario.as_yaml())) == scenario
+    assert Scenario.model_validate(yaml.safe_load(scenario.as_yaml())).as_yaml() == scenario.as_yaml()
 
 
 def test_the_command_lists_cells_and_rejects_a_pattern_without_a_match(tmp_path: FilePath) -> None:

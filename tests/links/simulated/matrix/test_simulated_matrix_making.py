@@ -261,7 +261,7 @@ def test_a_wrong_configuration_is_reported_once_before_anything_is_made(tmp_path
     config.write_text(GRAPH.replace(", inputs: {goal: aim.servo_goal}", ""))
     with pytest.raises(LinkError, match="closed loop needs exactly one servo"):
         make_matrix(tmp_path / "m", [HOVER], range(1, 3), config, silent)
-    config.write_text(GRAPH.replace("velodyne.Lidar", "velodyne.Radar"))
+    config.write_text(GRAPH.replace("lidar.Lidar", "lidar.Radar"))
     with pytest.raises(ConfigError, match=r"fast.yaml:\d+: .*unknown link"):
         make_matrix(tmp_path / "m", [HOVER], range(1, 3), config, silent)
     assert not (tmp_path / "m").exists()

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import yaml
 
-from flow.config_error import ConfigError, Location
+from flow.config_error import ConfigError
 from flow.graph import load_graph
 from flow.link import LinkError, Record, Tap
 from flow.message import Message
@@ -80,7 +80,7 @@ class Goals(Tap):
 def replayed(records: list[Record], scenario: Scenario, config: FilePath) -> tuple[str, list[tuple[int, float]]]:
     """Output hash and goals of an open-loop replay."""
     digest, goals = Digest(), Goals()
-    graph = load_graph(config, sections={"rig": (yaml.safe_load(scenario.rig_yaml()), Location("test", 0))})
+    graph = load_graph(config, sections={"rig": (scenario.rig_yaml(), "test")})
     replay(graph, [r for r in records if not r.topic.startswith("/truth")], (digest, goals))
     return digest.hexdigest(), goals._seen
 
@@ -171,7 +171,7 @@ def test_sim_yaml_closes_the_loop_and_a_graph_without_servo_commands_is_rejected
 
 
 @pytest.mark.parametrize("topic", ["/truth/drone", "/truth/vehicle", "/truth"])
-@pytest.mark.parametrize("link", ["links.velodyne.Lidar", "links.dynamixel.Servo"])
+@pytest.mark.parametrize("link", ["links.lidar.Lidar", "links.dynamixel.Servo"])
 def test_no_stage_can_be_wired_to_truth(tmp_path: FilePath, topic: str, link: str) -> None:
     """Every path from a record to a stage starts at a source, and no source may have such a topic."""
     text = GRAPH.replace("links:\n", f"links:\n  spy: {{use: {link}, config: {{topic: {topic}}}}}\n")

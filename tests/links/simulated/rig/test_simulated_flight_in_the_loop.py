@@ -9,11 +9,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 
-from flow.config_error import Location
 from flow.graph import load_graph
-from flow.link import LinkError, Record
+from flow.link import LinkError, Record, Tap
+from flow.message import Message
 from flow.replay import replay
 from flow.taps import Digest
 from links.mavlink.transport.framing import parse_frame
@@ -22,6 +21,7 @@ from links.simulated.rig import closed_loop
 from links.simulated.rig.closed_loop import load_loop
 from links.simulated.rig.run import Simulation, simulate
 from links.simulated.rig.scenario import Scenario, load_scenario
+from stages.messages import DroneLocalPosition
 
 ROOT = Path(__file__).parents[4]
 CONFIG = ROOT / "configs/sim_flight_fixes.yaml"
@@ -41,17 +41,29 @@ def stack_of(simulation: Simulation) -> FlightStack:
     return simulation.flight.stack
 
 
-def fly(scenario: Scenario) -> tuple[list[Record], Simulation, str]:
-    loop = load_loop(CONFIG, scenario.rig_yaml(), "test", scenario.closed_loop)
+class Positions(Tap):
+    """Times and independence of the autopilot's positions as the graph gets them."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seen: list[tuple[int, bool]] = []
+
+    def see(self, output: str, message: Message, arrival_ns: int) -> None:
+        if isinstance(message, DroneLocalPosition):
+            self.seen.append((arrival_ns, message.independent))
+
+
+def fly(scenario: Scenario, *taps: Tap) -> tuple[list[Record], Simulation, str]:
+    loop = load_loop(CONFIG, scenario.rig_yaml(), "test", scenario.closed_loop, taps)
     simulation = Simulation(scenario, loop=loop)
     return list(simulation.records()), simulation, loop.output_hash
 
 
 @pytest.fixture(scope="module")
 def flown() -> tuple[list[Record], Simulation, str]:
-    """12 s: grd finds the heading and sends; the switch is at 9 s."""
-    plan = [{"do": "path", "for_s": 9}, {"do": "use_sources", "set": 2}, {"do": "hold", "for_s": 40}]
-    return fly(changed(load_scenario(FLIGHT), 12.0, {"plan": plan}))
+    """17 s: grd learns the yaw of the autopilot's axes and sends; the switch is at 14 s."""
+    plan = [{"do": "path", "for_s": 14}, {"do": "use_sources", "set": 2}, {"do": "hold", "for_s": 40}]
+    return fly(changed(load_scenario(FLIGHT), 17.0, {"plan": plan}))
 
 
 def messages(records: list[Record], topic: str, kind: str) -> list[tuple[Record, Any]]:
@@ -71,9 +83,9 @@ def test_sent_poses_reach_the_autopilot_and_it_flies_on_them(flown) -> None:
 def test_the_session_does_what_it_does_live_at_its_times(flown) -> None:
     """HEARTBEAT at 1 Hz, TIMESYNC at 4 Hz; replies to ours are stamped with the time of the request."""
     records, _, _ = flown
-    assert len(messages(records, "/autopilot/tx", "HEARTBEAT")) == pytest.approx(12, abs=2)
+    assert len(messages(records, "/autopilot/tx", "HEARTBEAT")) == pytest.approx(17, abs=2)
     asked = [m.ts1 for _, m in messages(records, "/autopilot/tx", "TIMESYNC") if m.tc1 == 0]
-    assert len(asked) == pytest.approx(48, abs=4)
+    assert len(asked) == pytest.approx(68, abs=5)
     replies = [(r, m) for r, m in messages(records, "/autopilot/rx", "TIMESYNC") if m.tc1 != 0]
     assert len(replies) > 40
     assert all(record.stamp_ns == message.ts1 and message.ts1 in asked for record, message in replies)
@@ -100,7 +112,7 @@ def test_records_are_in_order_of_arrival_and_the_outcome_is_the_last(flown) -> N
 
 def test_a_replay_of_the_recording_takes_the_same_steps(flown) -> None:
     records, simulation, output_hash = flown
-    rig = yaml.safe_load(simulation.scenario.rig_yaml()), Location("test", 0)
+    rig = simulation.scenario.rig_yaml(), "test"
     digest = Digest()
     received = [r for r in records if not r.topic.startswith("/truth")]
     replay(load_graph(CONFIG, sections={"rig": rig}), received, (digest,))
@@ -140,16 +152,44 @@ def test_a_gap_of_the_lidar_stops_the_fixes() -> None:
 
 
 def test_after_a_kill_grd_starts_anew_and_the_flight_goes_on() -> None:
-    scenario = changed(load_scenario(FLIGHT), 12.0, {"plan": [{"do": "path", "for_s": 20}]})
-    scenario = scenario.changed(closed_loop={"killed_s": (8.0, 9.0)})
-    records, simulation, _ = fly(scenario)
+    scenario = changed(load_scenario(FLIGHT), 17.0, {"plan": [{"do": "path", "for_s": 20}]})
+    scenario = scenario.changed(closed_loop={"killed_s": (13.0, 14.0)})
+    positions = Positions()
+    records, simulation, _ = fly(scenario, positions)
     start_ns = scenario.start_ns
     sent_s = np.array([(r.arrival_ns - start_ns) * 1e-9 for r in records if r.topic == "/autopilot/tx"])
-    assert not ((sent_s > 8.05) & (sent_s < 9.0)).any()
-    assert (sent_s > 9.0).any()
+    assert not ((sent_s > 13.05) & (sent_s < 14.0)).any()
+    assert (sent_s > 14.0).any()
+    first_ns = min(r.arrival_ns for r, _ in messages(records, "/autopilot/tx", "ODOMETRY"))
+    assert first_ns < start_ns + 13e9
+    assert all(independent == (at_ns < first_ns) for at_ns, independent in positions.seen if at_ns != first_ns)
+    assert positions.seen[-1][0] > start_ns + 16e9
     counters = {m.reset_counter for _, m in messages(records, "/autopilot/tx", "ODOMETRY")}
     assert counters
     assert not stack_of(simulation).quadrotor.crashed
+
+
+@pytest.mark.parametrize(
+    ("config", "flight", "killed_s"),
+    [("sim_flight_yaw_fixes", "hover_yaw_fixes", (14.0, 15.0)), ("sim_flight_fixes", "hover_fixes", (14.0, 15.0))],
+)
+def test_after_a_kill_with_a_state_file_poses_are_sent_again_within_5_s(
+    config: str, flight: str, killed_s: tuple[float, float], tmp_path: Path
+) -> None:
+    """The autopilot's estimate is not independent any more; the heading is that of the run before."""
+    state = f"links: {{autopilot: {{config: {{state_file: {tmp_path / 'sent.json'}}}}}}}"
+    (tmp_path / "config.yaml").write_text(f"include: {ROOT / 'configs' / config}.yaml\n{state}\n", encoding="utf-8")
+    plan = [{"do": "path", "for_s": killed_s[0] - 1}, {"do": "use_sources", "set": 2}, {"do": "hold", "for_s": 40}]
+    scenario = changed(
+        load_scenario(ROOT / "configs/scenarios/flight" / f"{flight}.yaml"), killed_s[1] + 4, {"plan": plan}
+    )
+    scenario = scenario.changed(closed_loop={"killed_s": killed_s})
+    loop = load_loop(tmp_path / "config.yaml", scenario.rig_yaml(), "test", scenario.closed_loop)
+    records, start_ns = list(Simulation(scenario, loop=loop).records()), scenario.start_ns
+    sent = messages(records, "/autopilot/tx", "ODOMETRY")
+    after_s = [(r.arrival_ns - start_ns) * 1e-9 for r, _ in sent if r.arrival_ns == r.stamp_ns]
+    assert max(s for s in after_s if s < killed_s[1]) == pytest.approx(killed_s[0], abs=0.1)
+    assert min(s for s in after_s if s > killed_s[1]) - killed_s[0] < 5.0
 
 
 def test_the_command_writes_the_flight_and_says_what_became_of_it(tmp_path: Path) -> None:

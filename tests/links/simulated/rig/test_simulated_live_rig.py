@@ -17,9 +17,9 @@ import yaml
 from flow.link import LinkError, Run
 from links.clock import host_time
 from links.dynamixel import Servo
+from links.lidar import Lidar
 from links.recording import RecordingReader
 from links.simulated import LiveRig
-from links.velodyne import Lidar
 from stages.messages import ServoGoal
 from tests.links.ports import free_ports
 

@@ -12,12 +12,12 @@ import yaml
 
 from flow.config_error import ConfigError
 from flow.link import LinkError, Record
+from links.lidar import Lidar
 from links.recording import RecordingReader
 from links.simulated.rig import run
 from links.simulated.rig.run import Simulation, simulate, simulate_records
 from links.simulated.rig.scenario import Scenario, load_scenario
 from links.simulated.world.path import Path, Waypoint
-from links.velodyne import Lidar
 from stages.geometry.frames import LidarMount, Pose, rotation_from_quaternion_xyzw, rotation_z
 
 ROOT = FilePath(__file__).parents[4]

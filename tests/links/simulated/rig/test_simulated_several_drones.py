@@ -11,6 +11,7 @@ import pytest
 from pydantic import ValidationError
 
 from flow.link import LinkError, Record
+from links.lidar import Lidar
 from links.runs.results import TRUTH_FILE, TRUTH_RETURNS_FILE, TRUTH_VEHICLE_FILE, TRUTH_VISIBLE_FILE
 from links.runs.truth import TruthLog
 from links.simulated.kernels.lidar import echoes
@@ -23,7 +24,6 @@ from links.simulated.world.mesh import RayScene, box
 from links.simulated.world.path import Path, Waypoint
 from links.simulated.world.scene import Scene, Truth, drone_shapes
 from links.simulated.world.vehicle import vehicle_mesh
-from links.velodyne import Lidar
 
 STREET = FilePath(__file__).parents[4] / "configs/scenarios/street_sweep.yaml"
 ASIDE = {"span_m": 0.8, "model": {"shape": "hexa"}, "path": {"waypoints": [{"t_s": 0, "xyz_m": [-4.0, -2.0, 7.0]}]}}

@@ -164,3 +164,22 @@ def test_the_vehicles_odometry_is_late_in_order_and_the_same_in_any_batches() ->
     arrivals = [r.arrival_ns for r in whole]
     assert arrivals == sorted(arrivals)
     assert min(r.arrival_ns - r.stamp_ns for r in whole) >= 4_000_000
+
+
+def test_a_frozen_odometry_repeats_its_pose_with_new_stamps_and_then_has_moved_on() -> None:
+    drive = Path(waypoints=(Waypoint(t_s=0, xyz_m=(0, 0, 0)), Waypoint(t_s=10, xyz_m=(50, 0, 0))))
+    settings = VehicleOdometrySettings(frozen_s=(4.0, 6.0))
+    odometry = VehicleOdometry(settings, drive, START_NS, 10.0, seed=1)
+    records = odometry.records(START_NS + 10_000_000_000)
+    since_s = np.array([(r.stamp_ns - START_NS) * 1e-9 for r in records])
+    assert np.diff(since_s).max() < 0.03
+    xyz = np.array([json.loads(r.data)["xyz_m"] for r in records])
+    frozen = (since_s >= 4.0) & (since_s < 6.0)
+    assert np.ptp(xyz[frozen], axis=0) == pytest.approx(np.zeros(3))
+    true_m = odometry.T_map_vehicle(np.array([r.stamp_ns for r in records]))[1]
+    np.testing.assert_allclose(xyz[~frozen], true_m[~frozen], atol=1e-5)
+    assert np.linalg.norm(xyz[frozen] - true_m[frozen], axis=1).max() > 5.0
+    at_m = drive.at(np.array([9.0]))[0][0]
+    np.testing.assert_allclose(
+        at_m + odometry.drift_m(9.0), odometry.T_map_vehicle(np.array([START_NS + 9 * 10**9]))[1][0]
+    )

@@ -8,9 +8,10 @@ import pytest
 from links.simulated.kernels.lidar import echoes
 from links.simulated.sensors.lidar import COARSE, FINE, FOOTPRINTS, Lidar, LidarSettings, sub_rays
 from links.simulated.world.mesh import RayScene, box, merge, quads
-from links.velodyne import vlp16
 from stages.geometry.frames import rotation_from_rpy_deg, rotation_z
+from stages.geometry.lidar_models import lidar_profile
 
+VLP16 = lidar_profile("VLP-16")
 START_NS = 1_748_773_230_000_000_000
 SHARES = np.full(4, 0.25)
 
@@ -38,7 +39,7 @@ def _wall(x_m: float, surface: str = "plaster", half_m: float = 200.0):
 
 def _fire(scene, sequences: int, R=None, seed: int = 1, **settings):
     lidar = Lidar(LidarSettings(**settings), START_NS, seed)
-    stamps = START_NS + vlp16.SEQUENCE_NS * np.arange(sequences)[:, None] + vlp16.PULSE_NS * np.arange(16)
+    stamps = START_NS + VLP16.sequence_ns * np.arange(sequences)[:, None] + VLP16.firing_ns[1] * np.arange(16)
     stamps = stamps.ravel().astype(np.int64)
     rotations = np.broadcast_to(np.eye(3) if R is None else R, (len(stamps), 3, 3)).copy()
     pulses = lidar.fire(stamps, rotations, np.zeros((len(stamps), 3)), scene)
@@ -122,7 +123,7 @@ def test_a_wall_is_measured_at_its_range_with_the_stated_noise() -> None:
     scene = _Scene(_wall(8.0))
     lidar, stamps, pulses = _fire(scene, 1900, laser_bias_m=0.0, dropout=0.0)
     azimuth, laser = lidar.azimuth_rad(stamps), np.arange(len(stamps)) % 16
-    elevation = np.radians(np.array(vlp16.ELEVATION_DEG, dtype=np.float64))[laser]
+    elevation = np.radians(np.array(VLP16.elevation_deg, dtype=np.float64))[laser]
     facing = np.cos(elevation) * np.sin(azimuth)
     ahead = facing > 0.5
     error = pulses.range_m[0, ahead] - 8.0 / facing[ahead]
@@ -159,7 +160,7 @@ def test_an_edge_gives_mixed_returns_only_within_a_pulse_length() -> None:
     def between(gap_m: float) -> int:
         edge = quads([[(6.0, -50, -50), (6.0, 0.3, -50), (6.0, 0.3, 50), (6.0, -50, 50)]], "plaster")
         lidar, stamps, pulses = _fire(_Scene(merge([edge, _wall(6.0 + gap_m)])), 1900, laser_bias_m=0.0)
-        elevation = np.radians(np.array(vlp16.ELEVATION_DEG, dtype=np.float64))[np.arange(len(stamps)) % 16]
+        elevation = np.radians(np.array(VLP16.elevation_deg, dtype=np.float64))[np.arange(len(stamps)) % 16]
         x = pulses.range_m[0] * np.cos(elevation) * np.sin(lidar.azimuth_rad(stamps))
         return int(np.count_nonzero((x > 6.1) & (x < 6.0 + gap_m - 0.1)))
 

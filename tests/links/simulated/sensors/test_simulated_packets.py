@@ -12,19 +12,22 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flow.link import Record
-from links.simulated.sensors.vlp16_packets import encode_packet, encode_position, firings_per_packet
-from links.velodyne import Lidar, vlp16
-from links.velodyne.position import Pps, parse_position
+from links.lidar import Lidar
+from links.lidar.position import Pps, parse_position
+from links.simulated.sensors.lidar_packets import PacketEncoder, encode_position
+from stages.geometry.lidar_models import lidar_profile
+from stages.geometry.rig_lidar import RigLidar
 from stages.messages import LidarFirings
 
+VLP16 = lidar_profile("VLP-16")
 START_NS = 1_748_773_230_000_000_000  # 10:20:30 UTC
 
 
 def _packet(mode: str, first_ns: int, azimuth_deg: float, range_m: np.ndarray, shade: np.ndarray) -> bytes:
-    blocks = firings_per_packet(mode) // 2
-    step = 360.0 * 10 * 2 * vlp16.SEQUENCE_NS * 1e-9
-    azimuth = np.radians(azimuth_deg + step * np.arange(blocks))
-    return encode_packet(first_ns, azimuth, range_m, shade, mode)
+    encoder = PacketEncoder(RigLidar(), mode)
+    step = 360.0 * 10 * VLP16.sequence_ns * 1e-9
+    azimuth = np.radians(azimuth_deg + step * np.arange(encoder.sequences))
+    return encoder.encode(first_ns, azimuth, range_m, shade)
 
 
 def _decode(data: bytes, stamp_ns: int) -> LidarFirings:
@@ -51,7 +54,7 @@ def test_the_decoder_reads_what_was_encoded(seed: int, azimuth_deg: float, mode:
     np.testing.assert_allclose(firings.range_m, (0.002 * ticks).ravel(), atol=1e-5)
     np.testing.assert_array_equal(firings.reflectivity, np.where(ticks > 0, shade, 0).ravel())
     np.testing.assert_array_equal(firings.laser, np.tile(np.arange(16), 24))
-    since_ns = vlp16.SEQUENCE_NS * np.arange(24)[:, None] + vlp16.PULSE_NS * np.arange(16)
+    since_ns = VLP16.sequence_ns * np.arange(24)[:, None] + VLP16.firing_ns[1] * np.arange(16)
     np.testing.assert_array_equal(firings.pulse_stamp_ns - first_ns, since_ns.ravel())
     turned = np.mod(firings.azimuth_rad - math.radians(azimuth_deg) - math.tau * 10 * since_ns.ravel() * 1e-9, math.tau)
     assert np.minimum(turned, math.tau - turned).max() < math.radians(0.02)
@@ -84,7 +87,9 @@ def test_the_ends_of_a_packet_are_as_in_the_manual() -> None:
 
 def test_a_row_of_the_wrong_length_is_rejected() -> None:
     with pytest.raises(ValueError, match=r"dual packets take ranges \(2, 12, 16\), got \(1, 24, 16\)"):
-        encode_packet(0, np.zeros(12), np.zeros((1, 24, 16)), np.zeros((1, 24, 16), dtype=np.uint8), "dual")
+        PacketEncoder(RigLidar(), "dual").encode(
+            0, np.zeros(12), np.zeros((1, 24, 16)), np.zeros((1, 24, 16), dtype=np.uint8)
+        )
 
 
 def test_a_position_packet_has_the_time_and_a_locked_clock():

@@ -6,13 +6,15 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from links.simulated.kernels.lidar import APERTURE_M, FOOTPRINT_RAD
+from links.simulated.kernels.lidar import APERTURE_M
 from links.simulated.matrix.sim_vs_real import StaticScene
 from links.simulated.sensors.lidar import Lidar, LidarSettings
 from links.simulated.world.mesh import RayScene, quads
 from links.simulated.world.weather import CLUTTER_REACH_M, RainClutter, Weather, haze_extinction_per_m
-from links.velodyne import vlp16
+from stages.geometry.lidar_models import lidar_profile
 
+VLP16 = lidar_profile("VLP-16")
+FOOTPRINT_RAD = VLP16.footprint_rad
 START_NS = 1_748_773_230_000_000_000
 THRESHOLD = 0.10 / 65.0**2
 
@@ -24,13 +26,13 @@ def _wall(x_m: float, surface: str = "plaster"):
 def _fire(mesh, sequences: int, weather: Weather, batches: int = 1, **settings):
     """Ranges and reflectivities (n,) and each pulse's cosine to +x."""
     lidar = Lidar(LidarSettings(laser_bias_m=0.0, dropout=0.0, **settings), START_NS, 1, weather)
-    stamps = START_NS + vlp16.SEQUENCE_NS * np.arange(sequences)[:, None] + vlp16.PULSE_NS * np.arange(16)
+    stamps = START_NS + VLP16.sequence_ns * np.arange(sequences)[:, None] + VLP16.firing_ns[1] * np.arange(16)
     stamps = stamps.ravel().astype(np.int64)
     eye, around, found = np.eye(3), StaticScene(mesh), []
     for part in np.split(stamps, batches):
         pulses = lidar.fire(part, np.broadcast_to(eye, (len(part), 3, 3)).copy(), np.zeros((len(part), 3)), around)
         found.append((pulses.range_m[0], pulses.reflectivity[0]))
-    elevation = np.radians(np.array(vlp16.ELEVATION_DEG, dtype=float))[np.arange(len(stamps)) % 16]
+    elevation = np.radians(np.array(VLP16.elevation_deg, dtype=float))[np.arange(len(stamps)) % 16]
     cosine = np.cos(elevation) * np.sin(lidar.azimuth_rad(stamps))
     ranges, shade = (np.concatenate(column) for column in zip(*found, strict=True))
     return ranges, shade, cosine

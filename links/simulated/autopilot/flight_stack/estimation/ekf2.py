@@ -32,11 +32,9 @@ from stages.geometry.frames import Array64
 class Ekf2(Ekf3):
     """EKF2 with the interface of Ekf3."""
 
-    def __init__(
-        self, sets: tuple[Sources, ...], options: int, gps: GpsSettings, yaw_rad: float | None, gyro_bias: Array64
-    ) -> None:
-        super().__init__(sets, 0, gps, yaw_rad, gyro_bias)
-        self.lane = Lane(EKF2, np.zeros(3), yaw_rad or 0.0, gyro_bias)
+    def __init__(self, sets: tuple[Sources, ...], options: int, gps: GpsSettings, yaw_rad: float | None) -> None:
+        super().__init__(sets, 0, gps, yaw_rad)
+        self.lane = Lane(EKF2, np.zeros(3), yaw_rad or 0.0)
         self._newest_ns: int | None = None  # of the samples of external vision
         self._resets_left = PX4_EV_RESETS
         self._started = False

@@ -37,11 +37,9 @@ BARO_OFFSET_GAIN, BARO_OFFSET_STEP_M = 0.1, 5.0  # calcFiltBaroOffset, while ano
 class Ekf3:
     """One core of EKF3 with its sources."""
 
-    def __init__(
-        self, sets: tuple[Sources, ...], options: int, gps: GpsSettings, yaw_rad: float | None, gyro_bias: Array64
-    ) -> None:
+    def __init__(self, sets: tuple[Sources, ...], options: int, gps: GpsSettings, yaw_rad: float | None) -> None:
         """yaw_rad: of the compass at boot; None without a compass: the yaw is not aligned."""
-        self.lane = Lane(EKF3, np.zeros(3), yaw_rad or 0.0, gyro_bias)
+        self.lane = Lane(EKF3, np.zeros(3), yaw_rad or 0.0)
         self.status = InnovationRatios()
         self.active = 0
         self.origin = False

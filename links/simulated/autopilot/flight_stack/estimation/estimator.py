@@ -16,7 +16,7 @@ from links.simulated.autopilot.flight_stack.estimation.ekf3 import Ekf3
 from links.simulated.autopilot.flight_stack.estimation.external_input import ArduPilotInput, Px4Input
 from links.simulated.autopilot.flight_stack.estimation.source_rules import SOURCE_SETS, AidingSource, Sources
 from links.simulated.autopilot.flight_stack.failsafe import EkfCheck
-from links.simulated.autopilot.flight_stack.quadrotor import TICK_S, Quadrotor
+from links.simulated.autopilot.flight_stack.quadrotor import TICK_S
 from links.simulated.autopilot.flight_stack.sensors import GpsFix
 from links.simulated.autopilot.flight_stack.settings import FlightStackSettings
 from stages.geometry.frames import Array64
@@ -25,13 +25,12 @@ from stages.geometry.frames import Array64
 class Estimators:
     """Cores (one, or two with an IMU each), and, as a test instrument, one that reports independently of poses."""
 
-    def __init__(self, settings: FlightStackSettings, yaw_rad: float, quadrotor: Quadrotor, seed: int) -> None:
+    def __init__(self, settings: FlightStackSettings, yaw_rad: float, seed: int) -> None:
         self._settings = settings
         self._sets = tuple(SOURCE_SETS[name] for name in settings.source_sets)
         self._px4 = settings.kind == "px4"
         self._rng = np.random.default_rng([seed, 43])
         imu = settings.imu
-        self._calibrated = imu.gyro_calibrated * quadrotor.gyro_bias
         self._other = np.concatenate(  # bias of the second IMU relative to the first
             [
                 math.radians(imu.gyro_bias_degps) * self._rng.standard_normal(3),
@@ -45,20 +44,17 @@ class Estimators:
         """Boot: all cores begin again, with the yaw of the compass."""
         compass = any(one.yaw is AidingSource.BARO for one in self._sets)
         count = self._settings.lanes
-        gyro = [self._calibrated, self._calibrated + self._settings.imu.gyro_calibrated * self._other[0:3]]
-        self.cores = [self._core(self._sets, yaw_rad if compass else None, gyro[i]) for i in range(count)]
-        self._independent = (
-            self._core(self._sets[:1], yaw_rad, gyro[0]) if self._settings.independent_telemetry else None
-        )
+        self.cores = [self._core(self._sets, yaw_rad if compass else None) for _ in range(count)]
+        self._independent = self._core(self._sets[:1], yaw_rad) if self._settings.independent_telemetry else None
         self._primary = 0
         self._resets: list[tuple[Array64, float]] = []
         delay = self._settings.viso_delay_ms
         self.input = Px4Input(ekf2_ev_delay_ms=delay) if self._px4 else ArduPilotInput(viso_delay_ms=delay)
 
-    def _core(self, sets: tuple[Sources, ...], yaw_rad: float | None, gyro_bias: Array64) -> Ekf3:
+    def _core(self, sets: tuple[Sources, ...], yaw_rad: float | None) -> Ekf3:
         s = self._settings
         cls = Ekf2 if self._px4 else Ekf3
-        return cls(sets, s.source_options, s.gps, yaw_rad, gyro_bias)
+        return cls(sets, s.source_options, s.gps, yaw_rad)
 
     @property
     def primary(self) -> Ekf3:

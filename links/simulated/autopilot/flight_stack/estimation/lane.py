@@ -21,13 +21,12 @@ from stages.geometry.frames import Array64
 class Lane:
     """State, covariance and horizon of one core. Frame odom: z up, x north, or the axes of an external source."""
 
-    def __init__(self, rules: FilterRules, position_m: Array64, yaw_rad: float, gyro_bias: Array64) -> None:
-        """Start level at rest, with the gyro's calibration of the boot."""
+    def __init__(self, rules: FilterRules, position_m: Array64, yaw_rad: float) -> None:
+        """Start level at rest."""
         self.rules = rules
         self.x = np.zeros(16)
         self.x[0:3] = position_m
         self.x[6:10] = (0.0, 0.0, math.sin(0.5 * yaw_rad), math.cos(0.5 * yaw_rad))
-        self.x[10:13] = gyro_bias
         sigma = [1.0] * 3 + [0.5] * 3 + [math.radians(3)] * 2 + [math.radians(10)]
         self.P = np.diag([s * s for s in [*sigma, *[math.radians(0.15)] * 3, *[0.1] * 3]])
         self.horizon_ns = 0

@@ -92,7 +92,7 @@ def test_a_yaw_reset_keeps_the_tilt_and_takes_the_yaw() -> None:
 
 def test_the_horizon_is_behind_and_the_output_is_now() -> None:
     """At 1 m/s the horizon is 0.24 m behind the output."""
-    lane = Lane(EKF3, np.zeros(3), 0.0, np.zeros(3))
+    lane = Lane(EKF3, np.zeros(3), 0.0)
     lane.x[3] = 1.0
     for k in range(100):
         lane.advance((k + 1) * 10_000_000, np.array([0, 0, 0, 0, 0, GRAVITY_MPS2]) * DT)
@@ -102,7 +102,7 @@ def test_the_horizon_is_behind_and_the_output_is_now() -> None:
 
 
 def test_the_test_ratio_is_the_innovation_over_the_gate() -> None:
-    lane = Lane(EKF3, np.zeros(3), 0.0, np.zeros(3))
+    lane = Lane(EKF3, np.zeros(3), 0.0)
     lane.P[0, 0] = lane.P[1, 1] = 0.5
     ratio = lane.ratio(slice(0, 2), np.array([3.0, 4.0]), 0.5, 5.0)
     assert ratio == pytest.approx(25.0 / (25.0 * 2.0))

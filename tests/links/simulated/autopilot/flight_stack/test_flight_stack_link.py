@@ -57,6 +57,23 @@ def test_message_intervals_are_kept_truncated_or_denied(kind, message, interval_
     assert made.interval_us(message) == kept_us
 
 
+def passed(made: Streams, plan_ms: int) -> int:
+    """Messages of a plan that are sent in 10 s."""
+    return sum(made.passes(RAW_IMU, time_ms * 1_000_000) for time_ms in range(0, 10_000, plan_ms))
+
+
+def test_a_message_of_a_plan_passes_at_the_requested_rate_truncated_to_milliseconds() -> None:
+    made = Streams("ardupilot", {}, ())
+    assert passed(made, 10) == 1000
+    made.set_interval(RAW_IMU, 40_900)
+    assert passed(made, 10) == 250
+    made.set_interval(RAW_IMU, -1)
+    assert passed(made, 10) == 0
+    made.set_interval(RAW_IMU, 0)
+    assert passed(made, 10) == 1000
+    assert made.set_interval(RAW_IMU, 20_000, third=1.0) == DENIED
+
+
 def test_a_command_is_acknowledged_and_a_denied_message_stays_as_it_was() -> None:
     host = Host(4.0, autopilot={"imu_hz": 0.0}, denied_intervals=[streams.ATTITUDE])
     host.run(1.0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 
 import numpy as np
@@ -10,14 +9,16 @@ import pytest
 
 from flow.link import Record
 from links.simulated.autopilot.flight_stack.outcome import FlightOutcome
+from links.simulated.sensors.vehicle_odometry import VehicleOdometry, VehicleOdometrySettings
 from links.simulated.world.mesh import RayScene, box
 from links.simulated.world.scene import Truth
+from stages.geometry.frames import rotation_z
 from tests.links.simulated.autopilot.flight_stack.sent_truth import PARKED, START_NS, Host
 
 
-def watched(host: Host, world: RayScene | None = None) -> FlightOutcome:
+def watched(host: Host, world: RayScene | None = None, odometry: VehicleOdometry | None = None) -> FlightOutcome:
     scene = world or RayScene(box((-500, -500, -500), (-499, -499, -499), "metal"))
-    return FlightOutcome(host.stack, scene, Truth(START_NS, PARKED, host.stack.motion))
+    return FlightOutcome(host.stack, scene, Truth(START_NS, PARKED, host.stack.motion), odometry)
 
 
 def sent(host: Host, outcome: FlightOutcome, shift_m: float = 0.0, yaw_deg: float = 0.0) -> None:
@@ -49,15 +50,60 @@ def test_a_pose_is_wrong_above_one_metre_or_ten_degrees(shift_m: float, yaw_deg:
 
 
 def test_a_drift_of_the_vehicles_odometry_is_no_error_of_the_pose() -> None:
+    class Shifted(VehicleOdometry):
+        def T_map_vehicle(self, stamp_ns):
+            return np.tile(np.eye(3), (len(stamp_ns), 1, 1)), np.tile([1.5, 0.0, 0.0], (len(stamp_ns), 1))
+
+    host = Host(3.0)
+    outcome = watched(host, odometry=Shifted(VehicleOdometrySettings(), PARKED, START_NS, 3.0, seed=1))
+    host.run(2.0)
+    sent(host, outcome, shift_m=1.5)
+    assert outcome.result().sent_worst_m == pytest.approx(0.0, abs=0.2)
+
+
+@pytest.mark.parametrize(("shift_m", "yaw_deg", "inside"), [(0.0, 0.0, (1, 1)), (0.5, 0.0, (0, 1)), (0.0, 6.0, (1, 0))])
+def test_the_share_inside_is_that_of_the_covariance_in_the_message(
+    shift_m: float, yaw_deg: float, inside: tuple[int, int]
+) -> None:
+    """One sigma is 0.1 m and 1.1 deg, in `Host.pose`."""
     host = Host(3.0)
     outcome = watched(host)
     host.run(2.0)
-    for time_s in (0.0, 3.0):
-        stamp_ns = START_NS + round(time_s * 1e9)
-        pose = {"xyz_m": [1.5, 0.0, 0.0], "quaternion_xyzw": [0.0, 0.0, 0.0, 1.0]}
-        outcome.on_odometry(Record("/vehicle/odometry", stamp_ns, stamp_ns, json.dumps(pose).encode()))
-    sent(host, outcome, shift_m=1.5)
-    assert outcome.result().sent_worst_m == pytest.approx(0.0, abs=0.2)
+    sent(host, outcome, shift_m, yaw_deg)
+    result = outcome.result()
+    assert (result.inside_share, result.yaw_inside_share) == inside
+
+
+def test_a_position_without_yaw_is_compared_in_north_aligned_axes() -> None:
+    host = Host(3.0)
+    outcome = watched(host)
+    host.run(2.0)
+    north_yaw = host.stack.north_yaw_of_map
+    assert abs(math.sin(north_yaw)) > 0.1, "otherwise the test shows nothing"
+
+    def change(message, time_s: float) -> None:
+        x_north, y_west, _ = rotation_z(north_yaw) @ [message.x, -message.y, 0.0]
+        message.x, message.y, message.q = float(x_north), float(-y_west), [math.nan] * 4
+
+    host.edit = change
+    now_ns = START_NS + host.ticks * 10_000_000
+    outcome.on_sent(Record("/autopilot/tx", now_ns, now_ns, bytes(host.pose(now_ns).pack(host._mav))))
+    result = outcome.result()
+    assert result.sent_worst_m == pytest.approx(0.0, abs=0.2)
+    assert result.sent_yaw_rms_deg is None
+
+
+def test_the_longest_gap_lasts_from_one_pose_to_the_next_or_to_the_end() -> None:
+    host = Host(6.0)
+    outcome = watched(host)
+    assert outcome.result().longest_gap_s is None
+    host.run(1.0)
+    sent(host, outcome)
+    host.run(2.5)
+    sent(host, outcome)
+    assert outcome.result().longest_gap_s == pytest.approx(1.5, abs=0.02)
+    host.run(6.0)
+    assert outcome.result().longest_gap_s == pytest.approx(3.5, abs=0.02)
 
 
 def test_flying_into_an_obstacle_is_a_crash() -> None:

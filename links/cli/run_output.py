@@ -1,0 +1,123 @@
+"""What `grd run` and `grd replay` print at the end of a run.
+
+Source: ours.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rich.table import Table
+from rich.text import Text
+
+from flow.graph import Graph
+from flow.live.report import LiveReport
+from links.cli.console import out, show_table, warn
+from links.clock import Clock
+from links.runs.request import RunResult
+from links.runs.results import FIX_FILE, POSE_FILE, SUMMARY_FILE, stamp_s
+from links.zenoh import Receiver, Sender
+from stages.messages import PoseState
+
+TABLE_ROWS = 12
+
+
+def print_result(run: RunResult) -> None:
+    """Print the fixes, a summary, and the paths of the output files."""
+    results, report = run.results, run.report
+    live = isinstance(report, LiveReport)
+    for text in () if live else run.warnings:  # a live run has printed them already
+        warn(text)
+    if results.fixes:
+        show_table(_fix_table(run))
+    recorded_s = (report.last_ns - report.first_ns) / 1e9
+    parts = f" in {run.parts} parts" if run.parts is not None and run.parts > 1 else ""
+    found = f"drone accepted in {results.sweeps_with_drone} of {results.sweeps} sweeps, {len(results.fixes)} fixes"
+    out.print(
+        f"{report.records} records{parts}, {recorded_s:.1f} s recorded, {run.wall_s:.1f} s to run; "
+        f"{'no stage searches for a drone' if run.stage_outputs else found}"
+    )
+    if run.stage_outputs:
+        out.print(f"ran: {run.stage_outputs}", markup=False)
+    elif not results.sweeps:
+        out.print("no drone: no sweep was completed")
+    elif not results.fixes:
+        for result, count, example in results.search_results:
+            out.print(f"in {count} of {results.sweeps} sweeps: {result.value}; the first: {example}", markup=False)
+    for change in results.transitions[-3:]:
+        name = f"track {change.track_id}" if change.track_id > 1 else "tracker"
+        out.print(f"{name} at {stamp_s(change.stamp_ns)} s: {change.state}, {change.reason}", markup=False)
+    if run.errors is not None and len(run.errors.stamps_ns):
+        x, y, z = run.errors.rmse_xyz_m
+        out.print(
+            f"errors against the truth: RMSE x/y/z {x:.3f} {y:.3f} {z:.3f} m, 3D {run.errors.rmse_m:.3f} m; "
+            f"truth inside the 95 % ellipsoid in {100 * run.errors.inside_95:.0f} % of fixes"
+        )
+    if results.pose_states:
+        states = ", ".join(f"{count} {state}" for state, count in results.pose_states.items())
+        out.print(f"fused poses: {states}; {results.resets} jumps")
+    rejected = [
+        f"{name}: {count} {reason}"
+        for name, counters in report.counters.items()
+        for reason, count in counters.rejected.items()
+        if count
+    ]
+    if rejected:
+        out.print(f"rejected: {'; '.join(rejected)}", markup=False)
+    if run.usage is not None and str(run.usage):
+        out.print(f"used: {run.usage}")
+    out.print(f"output hash {run.output_hash}")
+    if not run.stage_outputs:
+        out.print(f"positions   {run.out_dir / FIX_FILE}")
+    if results.pose_states:
+        out.print(f"poses       {run.out_dir / POSE_FILE}")
+    out.print(f"summary     {run.out_dir / SUMMARY_FILE}")
+    if live and run.recording.is_file():
+        out.print(f"flight      {run.recording}   (re-run: grd replay {run.recording} --as-live)")
+    rerun_files = sorted(run.out_dir.glob("*.rrd"))
+    for path in rerun_files:
+        out.print(f"recording   {path}   (view: grd view {path})")
+
+
+def _fix_table(run: RunResult) -> Table:
+    """A table of at most TABLE_ROWS fixes, evenly spaced; with a column of errors when the truth is known."""
+    fixes = run.results.fixes
+    errors = {}
+    if run.errors is not None:
+        errors = dict(zip(run.errors.stamps_ns.tolist(), run.errors.error_m, strict=True))
+    step = max(1, -(-len(fixes) // TABLE_ROWS))
+    table = Table(title=f"drone in the vehicle frame, {len(fixes[::step])} of {len(fixes)} fixes", title_justify="left")
+    heads = [
+        "t [s]",
+        "x forward [m]",
+        "y left [m]",
+        "z up [m]",
+        "sigma [m]",
+        "returns",
+        *(["error [m]"] if errors else []),
+    ]
+    for head in heads:
+        table.add_column(Text(head), justify="right")
+    for fix in fixes[::step]:
+        elapsed_s = (fix.stamp_ns - run.report.first_ns) / 1e9
+        sigma_m = float(fix.covariance_m2.trace()) ** 0.5
+        cells = [f"{elapsed_s:.2f}", *(f"{v:.2f}" for v in fix.xyz_vehicle_m), f"{sigma_m:.2f}", str(fix.hits)]
+        if errors:
+            error = errors.get(fix.stamp_ns)
+            cells.append("-" if error is None else f"{float((error @ error) ** 0.5):.2f}")
+        table.add_row(*cells)
+    return table
+
+
+def nothing_found(graph: Graph, result: RunResult, report: LiveReport, config: Path) -> list[str]:
+    """Why a live run was of no use, and what to do; empty when it found a drone, or searched for none."""
+    sensors = [name for name in report.links if not issubclass(graph.nodes[name].cls, (Clock, Receiver, Sender))]
+    silent = [name for name in sensors if not report.links[name].records]
+    searched = not result.stage_outputs
+    found = result.results.fixes or result.results.pose_states.keys() - {PoseState.LOST.name}
+    if not (sensors and silent == sensors) and (not searched or found):
+        return []
+    head = "no sensor sent anything" if silent == sensors else "no drone was found: no position was measured"
+    why = {name: report.statuses.get(name) or report.links[name].reason or "no record came" for name in silent}
+    reasons = [f"  {name}: {text}" for name, text in why.items()]
+    return [f"{head}; the sources without a record:" if silent else head, *reasons, f"check: grd preflight {config}"]

@@ -1,0 +1,232 @@
+"""Requests the autopilot's EKF to use the source set of grd, and set 1 again when poses end (`switch_source`).
+
+The switch to grd's set is requested (MAV_CMD_SET_EKF_SOURCE_SET) while all of this holds:
+
+    armed, in a mode without a target in global coordinates: the EKF's origin moves to grd's
+    its parameters are as `profiles.py` requires; they are read once after each boot
+    poses have been sent for MIN_SENDING_NS, and the newest contains a LiDAR position of the last second
+    its EKF reports its state, and no test ratio of position or velocity above MAX_RATIO
+    the poses move as its own estimate does (`poses/agreement.py`), unless its EKF has no position to compare
+
+A request that is denied, or that is not acknowledged three times, is not repeated until the autopilot boots. Nor is any
+after somebody else has selected another set: ArduPilot names a set that its remote control selects in a STATUSTEXT. It
+acknowledges our command without a text, and reports nowhere which set is in use.
+
+Set 1 is requested FALLBACK_AFTER_NS after the last pose, once a second until it is acknowledged, if its position is
+from another source than grd. ArduPilot alone does not return to it. Without a connection, or after the end of grd,
+nothing is requested: the pilot has to switch. Neither does grd that was restarted in flight request set 1 before it has
+requested its own set again, because it does not know which set is in use.
+
+Source: ours; ArduPilot GCS_MAVLINK::handle_command_set_ekf_source_set, RC_Channel::do_aux_function (EKF_SOURCE_SET),
+ArduCopter mode.h (numbers of modes), NavEKF3_core::send_status_report.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from links.mavlink.commands import ACCEPTED, ACK_TIMEOUT_NS, IN_PROGRESS, TEMPORARILY_REJECTED, command_long, is_answer
+from links.mavlink.poses.agreement import MotionAgreement
+from links.mavlink.poses.autopilot_estimate import AutopilotEstimate
+from links.mavlink.profiles import EXTERNAL, RequiredParameter, findings
+from links.mavlink.readers import CONSTANT_POSITION, HORIZONTAL_RELATIVE
+from links.mavlink.transport.framing import dialect
+from stages.messages import RelativePose
+
+SET_EKF_SOURCE_SET = 42007  # MAV_CMD
+FIRST_SET = 1  # flies without grd
+MODES = {0, 2, 4, 5, 16, 17}  # ArduCopter: Stabilize, AltHold, Guided, Loiter, PosHold, Brake
+ARMED = 128  # MAV_MODE_FLAG_SAFETY_ARMED
+MIN_SENDING_NS = 5_000_000_000  # ours: poses that are often interrupted cause no switch
+FALLBACK_AFTER_NS = 500_000_000  # without a pose; ArduPilot times out after 0.3 s, its EKF failsafe acts after 1 s
+MAX_FIX_AGE_NS = 1_000_000_000  # age of the LiDAR position in a pose
+MAX_STATUS_AGE_NS = 2_000_000_000  # age of the EKF's status
+MAX_RATIO = 0.5  # test ratio; above 1 the EKF rejects
+TRIES = 3
+PARAMETER_PERIOD_NS, PARAMETER_RETRY_PERIOD_NS = 200_000_000, 10_000_000_000  # of requests, and after TRIES of each
+USING = re.compile(r"Using EKF Source Set (\d)")
+
+
+class SourceSwitch:
+    """Requests source sets of one ArduPilot, in one run of grd. `source_set` None: none is requested."""
+
+    def __init__(
+        self,
+        source_set: int | None,
+        required: Sequence[RequiredParameter],
+        target: tuple[int, int],
+        own: tuple[int, int],
+        warn: Callable[[str], None],
+        pose_sigma_m: float,
+    ) -> None:
+        self.requests = 0
+        """How often a set was requested."""
+        self.agreement = MotionAgreement(pose_sigma_m)
+        self._set, self._required = source_set, required
+        self._target, self._own, self._warn = target, own, warn
+        self.on_boot()
+
+    def on_boot(self) -> None:
+        """The autopilot has booted, or may have: it uses set 1, and its parameters may have changed."""
+        self.active: int | None = FIRST_SET
+        """The set in use, as far as is known."""
+        self._values: dict[str, float] = {}
+        self._parameter_requests, self._parameter_ns = 0, 0
+        self._armed, self._mode = False, -1
+        self._status: tuple[int, Any] | None = None  # arrival and message
+        self._position_ns = 0  # newest LOCAL_POSITION_NED
+        self._blocked = ""  # why grd's set is not requested any more
+        self._pending: tuple[int, int] | None = None  # the set requested, and when
+        self._tries = 0
+        self._sending_ns: int | None = None  # since when poses are sent
+        self._sent: RelativePose | None = None  # newest sent pose
+        self._sent_ns = 0
+        self.agreement.restart()
+
+    @property
+    def status(self) -> str | None:
+        """Why no switch is requested any more, or what is wrong with the parameters; None: nothing to report."""
+        if self._set is None:
+            return None
+        if self._blocked:
+            return f"source set {self._set} is not requested: {self._blocked}"
+        read = not self._missing() or self._parameter_requests >= TRIES * len(self._required)
+        wrong = findings(self._required, self._values) if read else []
+        return f"source set {self._set} is not requested: {wrong[0]}" if wrong else None
+
+    def on_message(self, message: Any, arrival_ns: int) -> None:
+        """Take a message of the autopilot."""
+        if self._set is None:
+            return
+        kind = message.get_type()
+        if kind == "HEARTBEAT":
+            self._armed, self._mode = bool(message.base_mode & ARMED), message.custom_mode
+        elif kind == "EKF_STATUS_REPORT":
+            self._status = arrival_ns, message
+        elif kind == "LOCAL_POSITION_NED":
+            self._position_ns = arrival_ns
+        elif kind == "PARAM_VALUE" and message.param_id in self._missing():
+            self._values[message.param_id] = float(message.param_value)
+        elif kind == "STATUSTEXT":
+            self._on_text(message.text)
+        elif is_answer(message, SET_EKF_SOURCE_SET, self._own):
+            self._on_result(message.result)
+
+    def on_sent(self, pose: RelativePose, autopilot: AutopilotEstimate, now_ns: int) -> None:
+        """A pose was sent; `autopilot`: its newest estimate."""
+        if self._set is None:
+            return
+        if self._sending_ns is None or now_ns - self._sent_ns > FALLBACK_AFTER_NS:
+            self._sending_ns = now_ns
+            self.agreement.restart()
+        self._sent, self._sent_ns = pose, now_ns
+        off_m = self.agreement.add(pose, autopilot)
+        if off_m is not None and self.active != self._set:
+            self._warn(f"pose and autopilot differ by {off_m:.1f} m")
+
+    def due(self, now_ns: int) -> Any | None:
+        """The message to send now, if one is due."""
+        if self._set is None:
+            return None
+        if self._pending is not None:
+            return self._repeated(*self._pending, now_ns)
+        ended = self._sent is not None and now_ns - self._sent_ns > FALLBACK_AFTER_NS
+        if self.active == self._set and ended and self._can_fall_back():
+            return self._request(FIRST_SET, now_ns)
+        if self._missing():
+            return self._parameter_request(now_ns)
+        if self.active != self._set and not self._blocked and self._is_ready(now_ns):
+            return self._request(self._set, now_ns)
+        return None
+
+    def on_not_sent(self) -> None:
+        """The message of `due` could not be sent: it is due again at once."""
+        if self._pending is not None:
+            self._pending = self._pending[0], -ACK_TIMEOUT_NS
+            self._tries -= 1
+        self._parameter_ns = 0
+
+    def _is_ready(self, now_ns: int) -> bool:
+        """Whether everything holds that the switch to grd's set requires."""
+        pose = self._sent
+        if pose is None or self._sending_ns is None or now_ns - self._sent_ns > FALLBACK_AFTER_NS:
+            return False
+        if now_ns - self._sending_ns < MIN_SENDING_NS or not self._armed or self._mode not in MODES:
+            return False
+        if pose.measured_ns is None or pose.stamp_ns - pose.measured_ns > MAX_FIX_AGE_NS:
+            return False
+        if findings(self._required, self._values):
+            return False
+        if self._status is None or now_ns - self._status[0] > MAX_STATUS_AGE_NS:
+            return False
+        status = self._status[1]
+        ratios = status.pos_horiz_variance, status.velocity_variance
+        if any(math.isfinite(ratio) and ratio > MAX_RATIO for ratio in ratios):
+            return False
+        has_position = status.flags & HORIZONTAL_RELATIVE and not status.flags & CONSTANT_POSITION
+        return self.agreement.agrees(now_ns) if has_position else now_ns - self._position_ns > MAX_STATUS_AGE_NS
+
+    def _can_fall_back(self) -> bool:
+        """Whether set 1 has a position of another source than grd."""
+        return self._values.get("EK3_SRC1_POSXY", 0.0) not in (0.0, EXTERNAL)
+
+    def _missing(self) -> list[str]:
+        return [parameter.name for parameter in self._required if parameter.name not in self._values]
+
+    def _parameter_request(self, now_ns: int) -> Any | None:
+        first = self._parameter_requests < TRIES * len(self._required)
+        if now_ns - self._parameter_ns < (PARAMETER_PERIOD_NS if first else PARAMETER_RETRY_PERIOD_NS):
+            return None
+        missing = self._missing()
+        name = missing[self._parameter_requests % len(missing)]
+        self._parameter_requests += 1
+        self._parameter_ns = now_ns
+        return dialect().MAVLink_param_request_read_message(*self._target, name.encode("ascii"), -1)
+
+    def _request(self, number: int, now_ns: int) -> Any:
+        self.requests += self._pending is None
+        self._pending = number, now_ns
+        self._tries += 1
+        return command_long(self._target, SET_EKF_SOURCE_SET, float(number))
+
+    def _repeated(self, number: int, sent_ns: int, now_ns: int) -> Any | None:
+        """Repeat a request without acknowledgement; one for grd's set ends after TRIES, or without reason."""
+        if now_ns - sent_ns < ACK_TIMEOUT_NS:
+            return None
+        if number == self._set and (self._tries >= TRIES or not self._is_ready(now_ns)):
+            if self._tries >= TRIES:
+                self._block("not acknowledged")
+            self._pending, self._tries = None, 0
+            return None
+        return self._request(number, now_ns)
+
+    def _on_result(self, result: int) -> None:
+        if self._pending is None or result in (IN_PROGRESS, TEMPORARILY_REJECTED):
+            return
+        number, self._pending, self._tries = self._pending[0], None, 0
+        if result == ACCEPTED:
+            self.active = number
+            self._warn(f"autopilot uses source set {number}")
+        elif number == self._set:
+            self._block(f"rejected, MAV_RESULT {result}")
+        else:
+            self.active = None  # not known
+            self._blocked = f"the autopilot rejected source set {number} (MAV_RESULT {result})"
+            self._warn(f"source set {number} rejected: switch now")
+
+    def _on_text(self, text: str) -> None:
+        found = USING.search(text)
+        if found is None:
+            return
+        number, requested = int(found[1]), self.active if self._pending is None else self._pending[0]
+        if number not in (self._set, requested):
+            self._pending, self._tries = None, 0
+            self._block(f"the pilot selected set {number}")
+        self.active = number
+
+    def _block(self, reason: str) -> None:
+        self._blocked = reason
+        self._warn(f"no source switch: {reason}")

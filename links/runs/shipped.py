@@ -1,0 +1,38 @@
+"""The configurations and recordings that come with grd, found from any folder.
+
+In the repository and in an installed wheel `configs/` and `recordings/` are next to the package `links`.
+
+Source: ours.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+CONFIGS, RECORDINGS = ROOT / "configs", ROOT / "recordings"
+FOLDERS = (CONFIGS, RECORDINGS)
+
+
+def shipped(path: Path) -> Path:
+    """`path` where it exists; otherwise the file of that name that comes with grd, otherwise `path`.
+
+    `configs/quickstart.yaml`, `quickstart.yaml` and `quickstart` name the same file, as `street_sweep` names a
+    recording.
+    """
+    if path.exists() or path.is_absolute() or ".." in path.parts or path.suffix not in ("", ".yaml", ".mcap"):
+        return path
+    inside = [ROOT / path] if path.parts[0] in ("configs", "recordings") else [folder / path for folder in FOLDERS]
+    if not path.suffix:
+        inside += [folder / f"{path}{suffix}" for folder, suffix in zip(FOLDERS, (".yaml", ".mcap"), strict=True)]
+    return next((file for file in inside if file.is_file()), path)
+
+
+def shipped_option(path: Path | None) -> Path | None:
+    """The same for an option that may be left out."""
+    return None if path is None else shipped(path)
+
+
+def shipped_all(paths: list[Path] | None) -> list[Path] | None:
+    """The same for an option that may be repeated."""
+    return None if paths is None else [shipped(path) for path in paths]

@@ -1,0 +1,41 @@
+"""Error of a LiDAR position in `map`: white, and a bias that does not average out.
+
+Source: ours; the shares: stages/fuse/settings.py.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stages.fuse.settings import FuseErrors
+from stages.geometry.frames import Array64
+from stages.geometry.trajectory import VehicleTrajectory
+from stages.messages import DroneFix
+
+
+@dataclass(frozen=True)
+class FixCovariance:
+    """Covariances (3, 3), map axes [m2]."""
+
+    white: Array64
+    bias: Array64
+
+    @property
+    def whole(self) -> Array64:
+        """Their sum."""
+        return self.white + self.bias
+
+
+def fix_covariance(fix: DroneFix, vehicle: VehicleTrajectory, errors: FuseErrors) -> FixCovariance:
+    """Error of a LiDAR position, with that of the vehicle's extrapolated pose."""
+    whole = errors.fix_variance * fix.covariance_m2
+    bias = errors.fix_bias_share * whole
+    if fix.bias_covariance_m2 is not None:
+        bias = fix.bias_covariance_m2
+        whole = bias + errors.fix_variance * (fix.covariance_m2 - bias)
+    R, ahead = vehicle.at(fix.stamp_ns)[0], np.zeros((3, 3))
+    if vehicle.known_at(fix.stamp_ns):  # otherwise the vehicle frame serves as the map frame
+        ahead = vehicle.extrapolation_covariance_m2(fix.stamp_ns, fix.xyz_vehicle_m)
+    return FixCovariance(R @ (whole - bias + ahead) @ R.T, R @ bias @ R.T)

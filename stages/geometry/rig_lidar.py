@@ -1,0 +1,82 @@
+"""The LiDAR in the rig file: its model, its mount, and the beams of this unit.
+
+Source: ours.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from stages.geometry.frames import LidarMount
+from stages.geometry.lidar_models import LidarModel, LidarProfile, lidar_profile
+
+OusterProfile = Literal["LEGACY", "RNG19_RFL8_SIG16_NIR16", "RNG15_RFL8_NIR8", "RNG19_RFL8_SIG16_NIR16_DUAL"]
+
+
+def _is_none(value: object) -> bool:
+    return value is None  # rig files leave out what they do not use
+
+
+class LidarBeams(BaseModel):
+    """Beams of one unit, as measured by the manufacturer, in the packet's order; for an Ouster also its packets."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    elevation_deg: tuple[float, ...]
+    azimuth_deg: tuple[float, ...]  # offsets, positive in the sense of rotation
+    origin_mm: Annotated[float, Field(ge=0, le=100)] = 0.0  # Ouster: lidar_origin_to_beam_origin_mm
+    columns: Literal[512, 1024, 2048] = 1024  # Ouster: per turn
+    spin_hz: Literal[10, 20] = 10  # Ouster
+    columns_per_packet: Annotated[int, Field(ge=1, le=128)] = 16  # Ouster
+    packets: OusterProfile = "LEGACY"  # Ouster: udp_profile_lidar
+    serial: Annotated[int | None, Field(exclude_if=_is_none)] = (
+        None  # packets of another unit are refused; None: not checked
+    )
+
+
+class RigLidar(BaseModel):
+    """`rig.lidar`: an Ouster needs its `beams`; a Velodyne has none, a Hesai XT may have them."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    model: LidarModel = "VLP-16"
+    mount: LidarMount = LidarMount()
+    beams: Annotated[LidarBeams | None, Field(exclude_if=_is_none)] = None
+
+    @model_validator(mode="after")
+    def _beams_fit(self) -> RigLidar:
+        count = self.profile.lasers
+        if self.beams is None:
+            if self.model.startswith("OS"):
+                raise ValueError(
+                    f"beams: each {self.model} has its own: `grd import METADATA.json -o beams.yaml` writes them from "
+                    "the sensor's metadata (http://SENSOR/api/v1/sensor/metadata)"
+                )
+        elif {len(self.beams.elevation_deg), len(self.beams.azimuth_deg)} != {count}:
+            raise ValueError(
+                f"beams: the {self.model} has {count} lasers, not {len(self.beams.elevation_deg)}: of another sensor?"
+            )
+        elif not self.model.startswith(("OS", "XT")):
+            raise ValueError(f"beams: all units of the {self.model} have the same: leave them out")
+        return self
+
+    @property
+    def profile(self) -> LidarProfile:
+        """Datasheet of the model."""
+        return lidar_profile(self.model)
+
+    @property
+    def azimuth_offset_rad(self) -> tuple[float, ...]:
+        """Azimuth offset of each laser."""
+        profile = self.profile
+        offsets_deg = self.beams.azimuth_deg if self.beams else profile.azimuth_deg or (0.0,) * profile.lasers
+        return tuple(math.radians(offset) for offset in offsets_deg)
+
+    @property
+    def azimuth_delay_ns(self) -> tuple[int, ...]:
+        """Time from each laser's azimuth to its pulse."""
+        profile = self.profile
+        return (0,) * profile.lasers if profile.turns_while_firing else profile.firing_ns

@@ -1,0 +1,170 @@
+"""Yaw resets and reboots of the autopilot by its ATTITUDE."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega
+
+from links.mavlink import Autopilot
+from links.mavlink.poses.autopilot_estimate import AutopilotAttitude, AutopilotEstimate, EstimateEvent
+from links.mavlink.poses.gate import PoseLimits, RejectReason
+from links.mavlink.poses.pose_sender import PoseSender
+from links.mavlink.transport.framing import packed
+from links.simulated.rig.pose_loop import PEER, VirtualConnection
+from tests.links.mavlink.mavlink_poses import HOST0, MS, good_pose
+
+mavlink: Any = ardupilotmega
+
+
+def attitude(boot_ms: int, yaw_deg: float, rate_degps: float = 0.0, roll_deg: float = 0.0) -> Any:
+    radians = (math.radians(v) for v in (roll_deg, 0.0, math.remainder(yaw_deg, 360.0), 0.0, 0.0, rate_degps))
+    return mavlink.MAVLink_attitude_message(boot_ms, *radians)
+
+
+def events(messages: list[Any]) -> list[EstimateEvent | None]:
+    autopilot = AutopilotEstimate()
+    return [autopilot.add(message, HOST0) for message in messages]
+
+
+def test_a_turn_that_the_rates_explain_is_no_reset():
+    turning = [attitude(1000 + 100 * i, 170 + 12 * i, 120.0) for i in range(40)]
+    assert set(events(turning)) == {None}
+
+
+@pytest.mark.parametrize(
+    ("jump_deg", "event"), [(5.0, None), (-12.0, EstimateEvent.YAW_RESET), (180.0, EstimateEvent.YAW_RESET)]
+)
+def test_a_change_of_yaw_that_no_rate_explains_is_a_reset(jump_deg: float, event: EstimateEvent | None):
+    assert events([attitude(1000, 30.0), attitude(1100, 30.0), attitude(1200, 30.0 + jump_deg)])[-1] is event
+
+
+def test_in_a_fast_turn_the_rates_may_be_wrong_by_their_share():
+    turning = [attitude(1000 + 300 * i, 170 + 1.25 * 36 * i, 120.0) for i in range(20)]  # 25 % faster than the rates
+    assert set(events(turning)) == {None}
+
+
+def test_the_session_stops_positions_without_yaw_when_the_autopilot_resets_its_yaw():
+    link = Autopilot(yaw="none")
+    session = link.open_session(VirtualConnection(), lambda: HOST0, threaded=False)
+    mav = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+    for boot_ms, yaw_deg, sent in ((1000, 30.0, 1), (1100, 30.0, 2), (1200, 60.0, 2)):
+        list(session.receive(packed(attitude(boot_ms, yaw_deg), mav), PEER, HOST0))
+        session.send_pose(good_pose(HOST0 + (boot_ms - 1100) // 10 * MS))
+        assert session.counters.get("sent: ODOMETRY", 0) == sent
+    assert session.poses.rejected == {RejectReason.ODOM_YAW_RESET: 1}
+
+
+def test_over_a_gap_no_reset_is_seen():
+    assert events([attitude(1000, 30.0), attitude(2100, 90.0)]) == [None, None]
+
+
+def test_a_time_that_runs_backwards_is_a_boot_and_a_late_frame_is_ignored():
+    autopilot = AutopilotEstimate()
+    assert autopilot.add(attitude(60_000, 30.0), HOST0) is None
+    assert autopilot.add(attitude(59_900, 80.0), HOST0 + 1) is None
+    assert autopilot.attitude is not None
+    assert autopilot.attitude.arrival_ns == HOST0
+    assert autopilot.add(attitude(5000, 80.0), HOST0 + 2) is EstimateEvent.BOOTED
+    assert autopilot.attitude.arrival_ns == HOST0 + 2
+
+
+def test_any_message_with_a_time_since_boot_shows_a_boot_and_what_was_known_before_is_dropped():
+    autopilot = AutopilotEstimate()
+    autopilot.add(attitude(60_000, 30.0), HOST0)
+    position = mavlink.MAVLink_local_position_ned_message(60_010, 1, 2, -3, 1, 0, 0)
+    assert autopilot.add(position, HOST0) is None
+    assert autopilot.position is not None
+    np.testing.assert_allclose(autopilot.position.at(HOST0 + 100 * MS), [1.1, -2, 3])
+    assert autopilot.position.at(HOST0 + 400 * MS) is None
+    assert autopilot.add(mavlink.MAVLink_scaled_imu_message(2_000, *[0] * 9), HOST0) is EstimateEvent.BOOTED
+    assert autopilot.attitude is autopilot.position is None
+
+
+def test_one_that_is_not_finite_is_ignored():
+    assert events([attitude(1000, 30.0), attitude(1100, math.nan), attitude(1200, 30.0)]) == [None] * 3
+
+
+def test_after_a_yaw_reset_no_position_is_sent_until_the_autopilot_boots():
+    sender = PoseSender(("odometry",), PoseLimits(), yaw="none")
+    sender.autopilot.attitude = AutopilotAttitude(0.0, 0.0, 1.0, HOST0)
+    sender.on_yaw_reset()  # before the first pose: the yaw is still learnt
+    messages = sender.messages(good_pose(), HOST0)
+    assert len(messages) == 1
+    sender.on_sent(good_pose(), HOST0, messages)
+    sender.on_yaw_reset()
+    assert sender.messages(good_pose(HOST0 + 20 * MS), HOST0 + 20 * MS) == []
+    assert sender.rejected == {RejectReason.ODOM_YAW_RESET: 1}
+    sender.on_boot()
+    assert len(sender.messages(good_pose(HOST0 + 40 * MS, odom_yaw_rad=0.5), HOST0 + 40 * MS)) == 1
+
+
+def test_after_a_boot_no_position_is_sent_in_the_axes_of_before():
+    sender = PoseSender(("odometry",), PoseLimits(), yaw="none")
+    sender.autopilot.attitude = AutopilotAttitude(0.0, 0.0, 1.0, HOST0)
+    messages = sender.messages(good_pose(), HOST0)
+    assert len(messages) == 1
+    sender.on_sent(good_pose(), HOST0, messages)
+    sender.on_boot()
+    same = good_pose(HOST0 + 20 * MS)
+    assert sender.messages(same, same.stamp_ns) == []
+    assert sender.rejected == {RejectReason.ODOM_YAW: 1}
+    learnt_again = good_pose(HOST0 + 40 * MS, odom_yaw_rad=0.01)
+    assert len(sender.messages(learnt_again, learnt_again.stamp_ns)) == 1
+
+
+@pytest.mark.parametrize("was_sent", [True, False])
+def test_after_several_boots_no_position_is_sent_in_the_axes_of_the_first(was_sent: bool):
+    sender = PoseSender(("odometry",), PoseLimits(), yaw="none")
+    sender.autopilot.attitude = AutopilotAttitude(0.0, 0.0, 1.0, HOST0)
+    messages = sender.messages(good_pose(), HOST0)
+    if was_sent:
+        sender.on_sent(good_pose(), HOST0, messages)
+    for boot in range(1, 4):
+        sender.on_boot()
+        same = good_pose(HOST0 + boot * 20 * MS)
+        assert sender.messages(same, same.stamp_ns) == []
+    learnt_again = good_pose(HOST0 + 100 * MS, odom_yaw_rad=0.01)
+    assert len(sender.messages(learnt_again, learnt_again.stamp_ns)) == 1
+
+
+def test_far_from_the_first_position_none_is_sent_without_yaw():
+    """An error of the axes' yaw moves the position by that angle times the distance from the first one."""
+    limits, sigma_rad = PoseLimits(), math.radians(1.0)
+    sender = PoseSender(("odometry",), limits, yaw="none")
+    sender.autopilot.attitude = AutopilotAttitude(0.0, 0.0, 1.0, HOST0)
+    first = good_pose(odom_yaw_sigma_rad=sigma_rad)
+    sender.on_sent(first, HOST0, sender.messages(first, HOST0))
+    assert first.xyz_map_m is not None
+    limit_m = limits.position_sigma_m / sigma_rad
+    for number, (share, messages) in enumerate(((0.9, 1), (1.1, 0), (0.9, 1)), start=1):
+        xyz_map_m = first.xyz_map_m + np.array([0.0, share * limit_m, 3.0])
+        pose = good_pose(HOST0 + number * 20 * MS, odom_yaw_sigma_rad=sigma_rad, xyz_map_m=xyz_map_m)
+        sent = sender.messages(pose, pose.stamp_ns)
+        assert len(sent) == messages
+        if sent:
+            assert sent[0].pose_covariance[6] > (share * limit_m * sigma_rad) ** 2
+    assert sender.rejected == {RejectReason.ODOM_YAW_DISTANCE: 1}
+
+
+def test_landing_target_alone_is_no_sending_of_poses():
+    sender = PoseSender(("odometry", "landing_target"), PoseLimits(), yaw="none")
+    sender.autopilot.attitude = AutopilotAttitude(0.0, 0.0, 1.0, HOST0)
+    first = good_pose()
+    sender.on_sent(first, HOST0, sender.messages(first, HOST0))
+    assert sender.sending
+    counter = sender.reset_counter
+    sender.on_yaw_reset()
+    later = good_pose(HOST0 + 20 * MS)
+    messages = sender.messages(later, later.stamp_ns)
+    assert [message.get_type() for message in messages] == ["LANDING_TARGET"]
+    sender.on_sent(later, later.stamp_ns, messages)
+    assert not sender.sending
+    sender.on_boot()
+    again = good_pose(HOST0 + 4000 * MS, odom_yaw_rad=0.5)
+    sender.autopilot.attitude = AutopilotAttitude(0.0, 0.0, 1.0, again.stamp_ns)
+    assert {message.get_type() for message in sender.messages(again, again.stamp_ns)} == {"ODOMETRY", "LANDING_TARGET"}
+    assert sender.reset_counter == (counter + 1) % 256

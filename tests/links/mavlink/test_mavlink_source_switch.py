@@ -1,0 +1,361 @@
+"""Requests of the autopilot's source set: when, how often, refused, overridden by the pilot, and back to set 1."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import socket
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+from pymavlink.dialects.v20 import ardupilotmega
+
+from links.mavlink import Autopilot, source_switch
+from links.mavlink.poses.agreement import MotionAgreement
+from links.mavlink.poses.autopilot_estimate import AutopilotAttitude, AutopilotEstimate, AutopilotPosition
+from links.mavlink.poses.gate import PoseLimits
+from links.mavlink.profiles import required_parameters
+from links.mavlink.source_switch import SET_EKF_SOURCE_SET, SourceSwitch
+from links.mavlink.transport.framing import packed, parse_frame
+from links.simulated.rig.closed_loop import load_loop
+from links.simulated.rig.pose_loop import PEER, VirtualConnection
+from links.simulated.rig.run import Simulation
+from links.simulated.rig.scenario import load_scenario
+from stages.geometry.frames import rotation_z
+from tests.links.mavlink.mavlink_poses import HOST0, MS, good_pose
+from tests.links.mavlink.test_mavlink_live import listening
+
+mavlink: Any = ardupilotmega
+ROOT = Path(__file__).parents[3]
+REQUIRED = required_parameters("ardupilot", "measured", 2)
+ACCEPTED, DENIED = 0, 2
+SIGMA_M = PoseLimits().position_sigma_m
+POSITION, NO_POSITION = 0b1111, 0b10000111  # flags of EKF_STATUS_REPORT
+
+
+class Flight:
+    """An autopilot and poses in steps of 20 ms; the drone flies 1 m/s along x. Attributes change what it does."""
+
+    def __init__(self, **parameters: float) -> None:
+        self.texts: list[str] = []
+        self.switch = SourceSwitch(2, REQUIRED, (1, 1), (1, 197), self.texts.append, SIGMA_M)
+        self.values = {p.name: p.best for p in REQUIRED} | parameters
+        self.now_ns, self.step = HOST0, 0
+        self.results: list[int | None] = []  # of the next requests; then ACCEPTED; None: no answer
+        self.requested: list[int] = []
+        self.poses = self.armed = True
+        self.mode, self.ratio, self.flags = 5, 0.1, POSITION
+        self.yaw_error_rad, self.compass_rad = 0.0, 0.0
+        self.measured = True
+        self.own_speed_mps = 1.0
+        self.autopilot = AutopilotEstimate()
+
+    def fly(self, seconds: float) -> Flight:
+        for _ in range(round(50 * seconds)):
+            self.now_ns += 20 * MS
+            self.step += 1
+            self._receive()
+            request = self.switch.due(self.now_ns)
+            if request is not None:
+                self._answer(request)
+        return self
+
+    def _receive(self) -> None:
+        def give(message: Any) -> None:
+            self.switch.on_message(message, self.now_ns)
+
+        x_m = self.step * 0.02
+        if self.step % 25 == 1:
+            give(mavlink.MAVLink_heartbeat_message(2, 3, 128 if self.armed else 0, self.mode, 4, 3))
+            give(mavlink.MAVLink_ekf_status_report_message(self.flags, 0.1, self.ratio, 0, 0, 0))
+        if self.flags == POSITION:
+            v = self.own_speed_mps
+            message = mavlink.MAVLink_local_position_ned_message(self.step * 20, 50 + v * x_m, 7, -30, v, 0, 0)
+            self.autopilot.add(message, self.now_ns)
+            give(message)
+        if self.poses:
+            pose = good_pose(
+                self.now_ns, xyz_map_m=np.array([x_m, 2.0, 10.0]), R_map_drone=rotation_z(self.yaw_error_rad)
+            )
+            measured_ns = self.now_ns if self.measured else self.now_ns - 2_000 * MS
+            pose = dataclasses.replace(pose, odom_yaw_rad=None, measured_ns=measured_ns)
+            self.autopilot.attitude = AutopilotAttitude(0.0, 0.0, self.compass_rad, self.now_ns)
+            self.switch.on_sent(pose, self.autopilot, self.now_ns)
+
+    def _answer(self, request: Any) -> None:
+        if request.get_type() == "PARAM_REQUEST_READ":
+            name = request.param_id.decode() if isinstance(request.param_id, bytes) else request.param_id
+            if name in self.values:
+                frame = packed(
+                    mavlink.MAVLink_param_value_message(name.encode(), self.values[name], 9, 1, 0),
+                    mavlink.MAVLink(None),
+                )
+                self.switch.on_message(parse_frame(frame), self.now_ns)
+            return
+        assert (request.get_type(), request.command) == ("COMMAND_LONG", SET_EKF_SOURCE_SET)
+        self.requested.append(round(request.param1))
+        result = self.results.pop(0) if self.results else ACCEPTED
+        if result is not None:
+            self.switch.on_message(mavlink.MAVLink_command_ack_message(SET_EKF_SOURCE_SET, result), self.now_ns)
+
+    def say(self, text: str) -> None:
+        frame = packed(mavlink.MAVLink_statustext_message(6, text.encode()), mavlink.MAVLink(None))
+        self.switch.on_message(parse_frame(frame), self.now_ns)
+
+
+def test_the_set_is_requested_once_when_poses_are_sent_and_move_as_the_autopilot_does():
+    flight = Flight()
+    flight.fly(flight.switch.agreement.least_m - 0.5)  # at 1 m/s
+    assert flight.requested == []
+    flight.fly(20)
+    assert flight.requested == [2]
+    assert flight.switch.active == 2
+    assert flight.texts == ["autopilot uses source set 2"]
+
+
+def test_nothing_is_requested_unless_configured():
+    flight = Flight()
+    flight.switch = SourceSwitch(None, REQUIRED, (1, 1), (1, 197), flight.texts.append, SIGMA_M)
+    assert flight.fly(20).requested == []
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"armed": False},
+        {"mode": 3},  # Auto: its target is in global coordinates
+        {"mode": 6},  # RTL
+        {"ratio": 0.6},
+        {"measured": False},  # propagated without LiDAR
+        {"own_speed_mps": 0.0},  # it hovers: the poses are of another object
+        {"yaw_error_rad": math.radians(90)},
+        {"compass_rad": math.radians(30)},
+        {"poses": False},
+    ],
+    ids=str,
+)
+def test_the_set_is_not_requested_while_a_condition_does_not_hold(changes: dict[str, Any]):
+    flight = Flight()
+    for name, value in changes.items():
+        setattr(flight, name, value)
+    assert flight.fly(30).requested == []
+
+
+def test_a_drone_that_hovers_gives_no_evidence_that_its_poses_are_right():
+    agreement, autopilot, now_ns = MotionAgreement(SIGMA_M), AutopilotEstimate(), HOST0
+    for _ in range(1500):
+        now_ns += 20 * MS
+        autopilot.position = AutopilotPosition(now_ns, np.array([1.0, 2.0, 3.0]), np.zeros(3))
+        assert agreement.add(good_pose(now_ns), autopilot) is None
+    assert not agreement.agrees(now_ns)
+
+
+def agreed_after(ends: list[dict[str, Any]]) -> bool:
+    """Whether they agree after 6 s at 1 m/s, and then 20 ms with each of these changes of the pose."""
+    agreement, autopilot = MotionAgreement(SIGMA_M), AutopilotEstimate()
+    for step in range(300 + len(ends)):
+        now_ns, xyz_m = HOST0 + step * 20 * MS, np.array([0.02 * step, 0.0, 10.0])
+        autopilot.position = AutopilotPosition(now_ns, xyz_m, np.zeros(3))
+        autopilot.attitude = AutopilotAttitude(0.0, 0.0, 0.0, now_ns)
+        changes = ends[step - 300] if step >= 300 else {}
+        pose = dataclasses.replace(good_pose(now_ns, xyz_map_m=xyz_m, R_map_drone=np.eye(3)), odom_yaw_rad=None)
+        agreement.add(dataclasses.replace(pose, **changes), autopilot)
+    return agreement.agrees(now_ns)
+
+
+def test_another_track_a_reset_or_a_difference_ends_the_agreement():
+    assert agreed_after([{}])
+    assert not agreed_after([{"track_id": 7}])
+    assert not agreed_after([{"resets": 7}])
+    far = good_pose(HOST0, xyz_map_m=np.array([30.0, 0.0, 10.0]), R_map_drone=np.eye(3)).estimate
+    assert not agreed_after([{"estimate": far}])
+
+
+def test_after_a_pause_of_the_poses_they_have_to_agree_again():
+    flight = Flight()
+    flight.mode = 3  # no switch yet
+    flight.fly(10)
+    assert flight.switch.agreement.agrees(flight.now_ns)
+    flight.poses = False
+    flight.fly(0.6)
+    flight.poses = True
+    flight.fly(0.1)
+    assert not flight.switch.agreement.agrees(flight.now_ns)
+
+
+def test_a_difference_is_reported_and_counted():
+    flight = Flight()
+    flight.own_speed_mps = 0.0
+    flight.fly(10)
+    assert flight.switch.agreement.disagreements >= 3
+    assert flight.texts[0] == "pose and autopilot differ by 1.8 m"
+
+
+def test_an_autopilot_without_a_position_has_nothing_to_compare_and_is_switched():
+    flight = Flight(EK3_SRC1_POSXY=0.0)
+    flight.flags = NO_POSITION
+    assert flight.fly(10).requested == [2]
+
+
+def test_an_autopilot_that_has_a_position_but_does_not_send_it_is_not_switched():
+    flight = Flight()
+    flight.flags = POSITION | 16
+    assert flight.fly(20).requested == []
+
+
+def test_wrong_or_missing_parameters_prevent_the_request_and_are_named():
+    flight = Flight(EK3_SRC_OPTIONS=1.0)
+    assert flight.fly(20).requested == []
+    assert "EK3_SRC_OPTIONS is 1" in str(flight.switch.status)
+    flight = Flight()
+    del flight.values["VISO_TYPE"]
+    assert flight.fly(30).requested == []
+    assert "VISO_TYPE was not received" in str(flight.switch.status)
+
+
+def test_a_denied_request_is_reported_and_not_repeated():
+    flight = Flight()
+    flight.results = [DENIED]
+    flight.fly(30)
+    assert flight.requested == [2]
+    assert flight.texts == ["no source switch: rejected, MAV_RESULT 2"]
+    assert flight.switch.status == "source set 2 is not requested: rejected, MAV_RESULT 2"
+    flight.switch.on_boot()
+    assert flight.fly(30).requested == [2, 2]
+
+
+def test_a_request_without_acknowledgement_is_made_three_times():
+    flight = Flight()
+    flight.results = [None] * 10
+    assert flight.fly(30).requested == [2, 2, 2]
+    assert flight.texts == ["no source switch: not acknowledged"]
+
+
+def test_an_acknowledgement_for_another_requester_is_not_ours():
+    flight = Flight()
+    flight.results = [None] * 10
+    flight.fly(5.5)
+    foreign = mavlink.MAVLink_command_ack_message(SET_EKF_SOURCE_SET, ACCEPTED, 0, 0, 255, 190)
+    flight.switch.on_message(foreign, flight.now_ns)
+    assert flight.switch.active == 1
+
+
+def test_set_1_is_requested_when_poses_end_and_grds_set_again_when_they_have_returned():
+    flight = Flight().fly(10)
+    flight.poses = False
+    flight.results = [None, None]
+    flight.fly(0.4)
+    assert flight.requested == [2]
+    flight.fly(3)
+    assert flight.requested == [2, 1, 1, 1]
+    assert flight.switch.active == 1
+    flight.poses = True
+    flight.fly(4)
+    assert flight.requested[-1] == 1
+    assert flight.fly(10).requested[-1] == 2
+
+
+@pytest.mark.parametrize("source", [0.0, 6.0])
+def test_set_1_is_not_requested_if_it_has_no_position_of_another_source(source: float):
+    flight = Flight().fly(10)
+    flight.switch._values["EK3_SRC1_POSXY"] = source
+    flight.poses = False
+    assert flight.fly(5).requested == [2]
+
+
+def test_after_the_pilot_has_selected_another_set_nothing_is_requested():
+    flight = Flight().fly(10)
+    flight.say("Using EKF Source Set 1")
+    flight.fly(30)
+    assert flight.requested == [2]
+    assert flight.switch.status == "source set 2 is not requested: the pilot selected set 1"
+
+
+def test_a_set_that_the_pilot_selected_for_grd_also_falls_back():
+    flight = Flight()
+    flight.mode = 3
+    flight.fly(3).say("Using EKF Source Set 2")
+    flight.fly(3)
+    flight.poses = False
+    assert flight.fly(2).requested == [1]
+
+
+def test_it_needs_ardupilot_and_another_set_than_the_first():
+    for wrong in ({"profile": "px4"}, {"source_set": 1}):
+        with pytest.raises(ValidationError, match="switch_source: needs profile ardupilot and source_set 2 or 3"):
+            Autopilot(switch_source=True, **wrong)
+
+
+def test_a_reopened_link_knows_the_set_in_use_and_what_the_pilot_selected_until_the_autopilot_boots():
+    link = Autopilot(switch_source=True)
+    first = link.open_session(VirtualConnection(), lambda: HOST0, threaded=False)
+    text = mavlink.MAVLink_statustext_message(6, b"Using EKF Source Set 3")
+    frame = packed(text, mavlink.MAVLink(None, srcSystem=1, srcComponent=1))
+    assert len(list(first.receive(frame, PEER, HOST0))) == 1
+    first.close()
+    second = link.open_session(VirtualConnection(), lambda: HOST0, threaded=False)
+    assert second.switch.active == 3
+    assert second.switch.status == "source set 2 is not requested: the pilot selected set 3"
+    for boot_ms in (60_000, 1_000):
+        attitude = mavlink.MAVLink_attitude_message(boot_ms, 0, 0, 0, 0, 0, 0)
+        list(second.receive(packed(attitude, mavlink.MAVLink(None, srcSystem=1, srcComponent=1)), PEER, HOST0))
+    assert second.switch.active == 1
+    assert second.switch.status is None
+
+
+def test_over_a_socket_the_request_is_made_and_its_acknowledgement_read(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(source_switch, "MIN_SENDING_NS", 500 * MS)
+    monkeypatch.setattr(source_switch, "PARAMETER_PERIOD_NS", 20 * MS)
+    values = {p.name: p.best for p in REQUIRED}
+    sender, requested = mavlink.MAVLink(None, srcSystem=1, srcComponent=1), []
+    with listening(switch_source=True) as listener, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
+        link_address = "127.0.0.1", listener.link.port
+        peer.setblocking(False)
+
+        def send(message: Any) -> None:
+            peer.sendto(packed(message, sender), link_address)
+
+        def step() -> bool:
+            send(mavlink.MAVLink_heartbeat_message(2, 3, 128, 5, 4, 3))
+            send(mavlink.MAVLink_ekf_status_report_message(NO_POSITION, 0, 0, 0, 0, 0))
+            while True:
+                try:
+                    message = parse_frame(peer.recv(512))
+                except BlockingIOError:
+                    break
+                if message.get_type() == "PARAM_REQUEST_READ":
+                    name = message.param_id
+                    send(mavlink.MAVLink_param_value_message(name.encode(), values[name], 9, 1, 0))
+                elif message.get_type() == "COMMAND_LONG" and message.command == SET_EKF_SOURCE_SET:
+                    requested.append(message.param1)
+                    send(mavlink.MAVLink_command_ack_message(SET_EKF_SOURCE_SET, ACCEPTED, 0, 0, 1, 197))
+            session = listener.link._session
+            return session is not None and session.switch.active == 2
+
+        listener.send_poses(step)
+    assert requested == [2.0]
+    assert listener.link.counters["source sets requested"] == 1
+
+
+def test_a_flight_is_switched_to_grd_and_back_to_gps_when_the_lidar_ends(tmp_path: Path):
+    config = tmp_path / "switch.yaml"
+    include = ROOT / "configs/sim_flight_fixes.yaml"
+    config.write_text(
+        f"include: {include}\nlinks: {{autopilot: {{config: {{switch_source: true}}}}}}\n", encoding="utf-8"
+    )
+    scenario = load_scenario(ROOT / "configs/scenarios/flight/hover_fixes.yaml")
+    assert scenario.autopilot is not None
+    autopilot = scenario.autopilot.model_dump()
+    autopilot["flight_stack"]["plan"] = [{"do": "path", "for_s": 60}]
+    scenario = scenario.changed(duration_s=27.0, autopilot=autopilot, lidar_gaps_s=((21.0, 27.0),))
+    simulation = Simulation(scenario, loop=load_loop(config, scenario.rig_yaml(), "test", scenario.closed_loop))
+    for _ in simulation.records():
+        pass
+    assert simulation.flight is not None
+    stack = simulation.flight.stack
+    events = [what for _, what in stack.events]
+    assert events == ["plan: path", "source set 2", "source set 1"]
+    assert not stack.quadrotor.crashed

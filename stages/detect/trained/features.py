@@ -15,11 +15,14 @@ import numpy as np
 
 from stages.detect.candidate import Candidate
 from stages.detect.flight import Motion, straight_flight
+from stages.detect.motion_log_ratios import MotionLogRatios
 from stages.geometry.frames import Array64
 
-VERSION = 1
+VERSION = 2
 PULSE_RAD = math.radians(0.2)  # between two pulses of a laser, 600 rpm
 NONE_M = 4.0  # written where no large object is near
+WIRE_M, SINGLE_RETURN_WIRE_M = 20.0, 30.0  # to these ranges a wire returns pulses; several a scan pass, and one
+NOT_DISPLACED_NATS = 3.0  # cap of the log ratio over a static object that may seem to move as far
 
 
 class Feature(NamedTuple):
@@ -39,7 +42,9 @@ FEATURES: tuple[Feature, ...] = (
     Feature("first_returns", 0, "returns of the first scan pass"),
     Feature("return_ratio", 0, "returns over those of a beam across the drone"),
     Feature("single_share", 0, "share of scan passes with one return"),
+    Feature("return_count_nats", 0, "returns of each scan pass, as a drone's and not a wire's"),
     Feature("passed_pulses", -1, "pulses that passed through its middle"),
+    Feature("missed_returns", -1, "returns expected of these pulses"),
     Feature("free_sectors", 1, "sectors around it that pulses flew through"),
     Feature("least_free", 0, "scan passes in which its least observed sector was free"),
     Feature("neighbour_score", -1, "objects next to it"),
@@ -48,6 +53,7 @@ FEATURES: tuple[Feature, ...] = (
     Feature("large_object_share", -1, "share of scan passes next to a large object"),
     Feature("extent_ratio", 0, "mean extent over the drone's"),
     Feature("largest_extent_ratio", 0, "largest extent over the drone's"),
+    Feature("too_long_passes", -1, "scan passes in which it was longer than the drone"),
     Feature("round_chords", -1, "smooth, round chords"),
     Feature("rough_chords", 0, "chords that are not smooth"),
     Feature("speed_mps", 0, "speed over ground"),
@@ -57,11 +63,16 @@ FEATURES: tuple[Feature, ...] = (
     Feature("acceleration_sigma_mps2", 0, "sigma of its acceleration"),
     Feature("fastest_mps", 0, "highest speed that it significantly had"),
     Feature("hardest_mps2", 0, "highest acceleration that it significantly had"),
+    Feature("top_mps", 0, "speed that it reaches, with its turn"),
+    Feature("top_sigma_mps", 0, "sigma of that speed"),
+    Feature("calm_s", 1, "time in which it flew more calmly than a bird cruises"),
+    Feature("steady_s", 1, "time in which it flew straight"),
     Feature("scatter_m", 0, "scatter about a smooth path"),
     Feature("displacement_m", 0, "displacement since the first observation kept"),
     Feature("straight_mps", 0, "mean velocity since then"),
     Feature("straight_sigmas", 0, "the same in its sigmas"),
     Feature("climb_mps", 0, "mean vertical velocity"),
+    Feature("moves", 0, "it moved over ground"),
     Feature("motion_known", 0, "the vehicle's motion is known"),
     Feature("near_rejected", -1, "a rejected object near it"),
     Feature("revisited", -1, "a rejected object at its position"),
@@ -73,10 +84,12 @@ FEATURES: tuple[Feature, ...] = (
     Feature("flight_nats", 1, "agreed with the drone's odometry in open air"),
     Feature("misfit", -1, "residual from the drone's odometry"),
     Feature("odometry_displacement_m", 0, "displacement by the drone's odometry"),
+    Feature("displaced_nats", 1, "moves as the drone's odometry, farther than a static object may seem to"),
+    Feature("displaced_m", 0, "displacement by odometry beyond what a static object may seem to move"),
 )
 NAMES = tuple(feature.name for feature in FEATURES)
 TELEMETRY = NAMES.index("over_static_nats")  # NaN: not compared with telemetry
-NO_TELEMETRY = (math.nan,) * 7
+NO_TELEMETRY = (math.nan,) * 9
 
 
 def features_of(c: Candidate, span_m: float, motion_known: bool) -> Array64:
@@ -90,7 +103,9 @@ def features_of(c: Candidate, span_m: float, motion_known: bool) -> Array64:
     speed, sigmas, climb = straight_flight(c.path_ns, c.path_m, c.range_m)
     ratios = c.log_ratios
     since = math.nan if not c.reacquired_at else passes - c.reacquired_at
-    telemetry = NO_TELEMETRY if ratios is None else (*ratios[:4], c.flight_log_ratio, *ratios[4:])
+    telemetry = (
+        NO_TELEMETRY if ratios is None else (*ratios[:4], c.flight_log_ratio, *ratios[4:], *displaced(c, ratios))
+    )
     return np.array(
         [
             c.range_m,
@@ -101,7 +116,9 @@ def features_of(c: Candidate, span_m: float, motion_known: bool) -> Array64:
             c.first_returns,
             c.returns / c.observations * PULSE_RAD * c.range_m / span_m,
             c.single_returns / c.observations,
+            c.return_count_nats,
             c.passed_pulses,
+            c.missed_returns,
             np.count_nonzero(c.free >= 1.0),
             c.free.min(),
             c.neighbour_score,
@@ -110,6 +127,7 @@ def features_of(c: Candidate, span_m: float, motion_known: bool) -> Array64:
             c.large_object_passes / c.observations,
             c.total_extent_m / c.observations / span_m,
             c.largest_extent_m / span_m,
+            c.too_long_passes,
             c.round_chords,
             c.rough_chords,
             m.speed_mps,
@@ -119,11 +137,16 @@ def features_of(c: Candidate, span_m: float, motion_known: bool) -> Array64:
             m.acceleration_sigma_mps2,
             c.fastest_mps,
             c.hardest_mps2,
+            slower.top_mps,
+            slower.top_sigma_mps,
+            c.calm_s,
+            c.steady_s,
             m.spread_m,
             math.dist(c.path_m[0], c.path_m[-1]) if n > 1 else math.nan,
             speed,
             sigmas,
             climb,
+            c.moves(motion_known),
             motion_known,
             c.near_rejected,
             c.revisited,
@@ -132,6 +155,18 @@ def features_of(c: Candidate, span_m: float, motion_known: bool) -> Array64:
         ],
         dtype=np.float64,
     )
+
+
+def displaced(c: Candidate, ratios: MotionLogRatios) -> tuple[float, float]:
+    """(log ratio over the static object that would be visible at its range [nats], displacement beyond its own [m]).
+
+    A lamp whose pole is invisible, or a wire, may seem to move (`Candidate.apparent_motion_m`): a drone's odometry that
+    moved less is little evidence, unless the candidate agreed with it in open air before.
+    """
+    wire = c.range_m < (SINGLE_RETURN_WIRE_M if c.returns_singly else WIRE_M)
+    beyond_m = ratios.displacement_m - c.apparent_motion_m
+    nats = ratios.over_wire if wire else ratios.over_static
+    return max(nats if beyond_m > 0.0 else min(nats, NOT_DISPLACED_NATS), c.flight_log_ratio), beyond_m
 
 
 NOT_MEASURED = Motion(math.nan, math.nan, math.nan, math.nan, math.nan)

@@ -21,35 +21,41 @@ from scipy.optimize import minimize
 
 from flow.link import LinkError
 from links.training.candidates import CandidateRows
-from stages.detect.trained.features import FEATURES, NAMES, VERSION
-from stages.detect.trained.model import ALTERNATIVES, DetectorModel, Term
+from stages.detect.trained.features import FEATURES, NAMES, RANGE, TELEMETRY, VERSION
+from stages.detect.trained.model import ALTERNATIVES, ANY, FAR, NEAR, DetectorModel, Term, farness
 from stages.geometry.frames import Array64
 
 KNOTS = 6
+LEAST_KNOWN = 50  # rows that have a feature, to use it
 LLR_KNOTS = (-12.0, -6.0, -3.0, 0.0, 3.0, 6.0, 12.0)  # [nats] of features that are log likelihood ratios
-LLR_SHARE = {"over_static_nats": 0.45, "over_wire_nats": 0.45, "over_bird_nats": 0.9, "over_balloon_nats": 0.9}
+LLR_SHARE = {"displaced_nats": 0.8, "over_bird_nats": 0.9, "over_balloon_nats": 0.9, "return_count_nats": 0.5}
 PRIOR_PENALTY = 0.02  # of the priors, relative to the other parameters
-STRENGTHS = (1.0, 3.0, 10.0)
-FOLDS = 4
+STRENGTHS = (0.3, 1.0, 3.0)
+FOLDS = 3
 EASY_SHARE = 0.05  # of the single observations without telemetry that are used; they are most of all rows
 RANGES_M = (0.0, 15.0, 25.0, 35.0, 70.0)  # bands of the scores
 USED: tuple[tuple[str, ...], ...] = (  # features of each alternative
     (
         "existence_nats", "false_per_s", "range_m", "scan_passes", "age_s", "first_returns", "return_ratio",
-        "single_share", "passed_pulses", "neighbour_score",
+        "return_count_nats", "passed_pulses", "missed_returns", "neighbour_score",
     ),
     (
-        "range_m", "scan_passes", "single_share", "free_sectors", "least_free", "neighbour_score", "isolated_score",
-        "large_object_m", "large_object_share", "extent_ratio", "largest_extent_ratio", "scatter_m", "displacement_m",
-        "straight_mps", "straight_sigmas", "near_rejected", "revisited", "over_static_nats", "over_wire_nats",
-        "flight_nats", "misfit", "odometry_displacement_m",
+        "range_m", "scan_passes", "return_count_nats", "free_sectors", "least_free", "neighbour_score",
+        "isolated_score", "large_object_m", "large_object_share", "extent_ratio", "largest_extent_ratio",
+        "too_long_passes", "scatter_m", "displacement_m", "straight_mps", "straight_sigmas", "moves", "near_rejected",
+        "revisited", "displaced_nats", "misfit", "passes_since_reacquired",
     ),
     (
-        "range_m", "age_s", "return_ratio", "extent_ratio", "speed_mps", "relative_speed_mps", "acceleration_mps2",
-        "fastest_mps", "hardest_mps2", "scatter_m", "straight_sigmas", "climb_mps", "over_bird_nats", "misfit",
+        "range_m", "age_s", "return_ratio", "extent_ratio", "top_mps", "relative_speed_mps", "acceleration_mps2",
+        "fastest_mps", "hardest_mps2", "calm_s", "steady_s", "scatter_m", "straight_sigmas", "climb_mps",
+        "over_bird_nats", "misfit",
     ),
     ("range_m", "round_chords", "rough_chords", "straight_mps", "over_balloon_nats"),
 )  # fmt: skip
+RANGED = {  # features whose weight depends on the range: their terms are near and far
+    "scan_passes", "first_returns", "return_ratio", "free_sectors", "neighbour_score", "isolated_score",
+    "displaced_nats", "extent_ratio",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -69,6 +75,7 @@ class _Column:
 
     alternative: int
     feature: str
+    at: str  # any, near or far
     low: float
     high: float
     sign: int
@@ -121,18 +128,22 @@ def _columns(rows: CandidateRows, left_out: Sequence[str]) -> list[_Column]:
     some = np.concatenate([drones, rng.choice(others, min(3 * len(drones), len(others)), replace=False)])
     columns: list[_Column] = []
     for alternative, names in enumerate(USED):
-        columns += [_Column(alternative, "", told, told, 0, 2.0 * told) for told in (0.0, 1.0)]
+        columns += [_Column(alternative, "", ANY, told, told, 0, 2.0 * told) for told in (0.0, 1.0)]
         for name in names:
             if name in left_out:
                 continue
             x, share = rows.feature(name)[some], LLR_SHARE.get(name, 0.0)
             known = x[~np.isnan(x)]
+            if len(known) < LEAST_KNOWN:
+                continue
             is_llr = name in LLR_SHARE or name == "flight_nats"
             knots = np.array(LLR_KNOTS) if is_llr else np.unique(_rounded(np.quantile(known, _levels())))
             sign = FEATURES[NAMES.index(name)].monotone
-            columns += [_Column(alternative, name, a, b, sign, share * (b - a)) for a, b in pairwise(knots.tolist())]
-            if not name.endswith("_nats") and name not in ("misfit", "odometry_displacement_m"):
-                columns.append(_Column(alternative, name, np.nan, np.nan, 0, 0.0))
+            for at in (NEAR, FAR) if name in RANGED else (ANY,):
+                ramps = pairwise(knots.tolist())
+                columns += [_Column(alternative, name, at, a, b, sign, share * (b - a)) for a, b in ramps]
+                if not name.endswith("_nats") and name != "misfit":
+                    columns.append(_Column(alternative, name, at, np.nan, np.nan, 0, 0.0))
     return columns
 
 
@@ -146,7 +157,8 @@ def _rounded(values: Array64) -> Array64:
 
 def _design(X: Array64, columns: Sequence[_Column]) -> list[NDArray[np.float32]]:
     """The design matrix (n, parameters) of each alternative. Ramps of ratios below 0 are -1 to 0: 0 is no evidence."""
-    told = ~np.isnan(X[:, NAMES.index("over_static_nats")])
+    told, far = ~np.isnan(X[:, TELEMETRY]), farness(X[:, RANGE])
+    shares = {ANY: np.ones(len(X)), NEAR: 1.0 - far, FAR: far}
     found: list[NDArray[np.float32]] = []
     for alternative in range(len(ALTERNATIVES)):
         parts: list[Array64] = []
@@ -159,10 +171,10 @@ def _design(X: Array64, columns: Sequence[_Column]) -> list[NDArray[np.float32]]
             x = X[:, NAMES.index(c.feature)]
             missing = np.isnan(x)
             if np.isnan(c.low):
-                parts.append(missing.astype(np.float64))
+                parts.append(missing * shares[c.at])
             else:
                 ramp = np.clip((np.where(missing, 0.0, x) - c.low) / (c.high - c.low), 0.0, 1.0) - _start(c)
-                parts.append(np.where(missing, 0.0, ramp))
+                parts.append(np.where(missing, 0.0, ramp) * shares[c.at])
         found.append(np.column_stack(parts).astype(np.float32))
     return found
 
@@ -225,27 +237,28 @@ def _left_out_loss(
 
 def _model(columns: Sequence[_Column], theta: Array64, trained: dict[str, Any]) -> DetectorModel:
     priors = np.zeros((len(ALTERNATIVES), 2))
-    ramps: dict[tuple[int, str], list[tuple[_Column, float]]] = {}
-    missing: dict[tuple[int, str], float] = {}
+    ramps: dict[tuple[int, str, str], list[tuple[_Column, float]]] = {}
+    missing: dict[tuple[int, str, str], float] = {}
     for c, value in zip(columns, theta.tolist(), strict=True):
         if not c.feature:
             priors[c.alternative, int(c.low)] = value
         elif np.isnan(c.low):
-            missing[c.alternative, c.feature] = value
+            missing[c.alternative, c.feature, c.at] = value
         else:
-            ramps.setdefault((c.alternative, c.feature), []).append((c, value))
+            ramps.setdefault((c.alternative, c.feature, c.at), []).append((c, value))
     terms: list[Term] = []
-    for (alternative, feature), parts in ramps.items():
+    for (alternative, feature, at), parts in ramps.items():
         values = np.cumsum([0.0, *(value for _, value in parts)]) - sum(_start(c) * value for c, value in parts)
-        if np.abs(values).max() < 5e-4 and abs(missing.get((alternative, feature), 0.0)) < 5e-4:
+        if np.abs(values).max() < 5e-4 and abs(missing.get((alternative, feature, at), 0.0)) < 5e-4:
             continue
         terms.append(
             Term(
                 alternative=alternative,
                 feature=feature,
+                at=at,
                 knots=(parts[0][0].low, *(c.high for c, _ in parts)),
                 values=tuple(round(value, 4) for value in values.tolist()),
-                missing=round(missing.get((alternative, feature), 0.0), 4),
+                missing=round(missing.get((alternative, feature, at), 0.0), 4),
             )
         )
     rounded = tuple((round(without, 4), round(with_, 4)) for without, with_ in priors.tolist())

@@ -88,6 +88,7 @@ FEATURES: tuple[Feature, ...] = (
     Feature("displaced_m", 0, "displacement by odometry beyond what a static object may seem to move"),
 )
 NAMES = tuple(feature.name for feature in FEATURES)
+RANGE = NAMES.index("range_m")
 TELEMETRY = NAMES.index("over_static_nats")  # NaN: not compared with telemetry
 NO_TELEMETRY = (math.nan,) * 9
 

@@ -39,8 +39,9 @@ def write_run(folder, seed, candidates=60, rows=6, drop=()):
             for k in range(rows):
                 values = dict.fromkeys(NAMES, 0.0) | {
                     "range_m": rng.uniform(5, 40),
-                    "speed_mps": rng.normal(2.0 if drone else 6.0, 1.0),
-                    "over_static_nats": rng.normal(4.0 if drone else -4.0) if number % 2 else math.nan,
+                    "top_mps": rng.normal(2.0 if drone else 6.0, 1.0),
+                    "over_static_nats": 1.0 if number % 2 else math.nan,
+                    "displaced_nats": rng.normal(4.0 if drone else -4.0) if number % 2 else math.nan,
                 }
                 at = DRONE_M + (rng.normal(0, 0.1, 3) if drone else rng.uniform(3, 9, 3))
                 cells = ["" if math.isnan(values[name]) else f"{values[name]:.5g}" for name in names]
@@ -94,9 +95,9 @@ def test_the_scores_are_those_of_the_formula(runs):
 
 
 def test_a_feature_left_out_is_not_used(runs):
-    model = train(read_candidates(runs), {}, ["speed_mps"])
+    model = train(read_candidates(runs), {}, ["top_mps"])
     x = np.zeros(len(NAMES))
-    faster = np.where([f.name == "speed_mps" for f in FEATURES], 50.0, x)
+    faster = np.where([f.name == "top_mps" for f in FEATURES], 50.0, x)
     assert model.answer(x).log_odds == model.answer(faster).log_odds
 
 

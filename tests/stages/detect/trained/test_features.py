@@ -8,13 +8,17 @@ import numpy as np
 import pytest
 
 from stages.detect.motion_log_ratios import MotionLogRatios
-from stages.detect.trained.features import FEATURES, NAMES, PULSE_RAD, features_of
+from stages.detect.flight import lamp_sway_m
+from stages.detect.trained.features import FEATURES, NAMES, NOT_DISPLACED_NATS, PULSE_RAD, features_of
 from stages.geometry.frames import rotation_z
 from stages.kernels.detect.isolation import FREE_0, SECTORS
 from tests.stages.detect.test_candidate import PLACE_M, candidate, observation, path
 
 TELEMETRY = tuple(NAMES[NAMES.index("over_static_nats") :])
-MOTION = ("speed_mps", "relative_speed_mps", "acceleration_mps2", "scatter_m", "straight_mps", "climb_mps")
+MOTION = (
+    "speed_mps", "relative_speed_mps", "acceleration_mps2", "top_mps", "top_sigma_mps", "scatter_m", "straight_mps",
+    "climb_mps",
+)  # fmt: skip
 
 
 def named(c, span_m=0.5, motion_known=True):
@@ -80,7 +84,7 @@ def test_telemetry_is_a_part_of_the_same_features():
     c = candidate(*path((1.0, 0.0, 0.0)))
     c.add_log_ratios(MotionLogRatios(5.0, 4.0, 3.0, 2.0, 1.1, 0.9))
     features = named(c)
-    assert [features[name] for name in TELEMETRY] == [5.0, 4.0, 3.0, 2.0, 2.0, 1.1, 0.9]
+    assert [features[name] for name in TELEMETRY] == [5.0, 4.0, 3.0, 2.0, 2.0, 1.1, 0.9, 5.0, 0.9]
     c.add_log_ratios(None)
     assert all(math.isnan(named(c)[name]) for name in TELEMETRY)
 
@@ -90,3 +94,13 @@ def test_repeated_observations_raise_the_existence_and_distant_ones_do_not():
     scattered = candidate(*(observation(0.1 * k, PLACE_M + np.array([2.0 * (-1) ** k, 0.0, 0.0])) for k in range(4)))
     assert named(repeated)["existence_nats"] > 10
     assert named(repeated)["existence_nats"] > named(scattered)["existence_nats"] + 5
+
+
+def test_far_away_a_lamp_may_seem_to_move_as_far_as_a_drone():
+    near, far = (candidate(observation(0.0, range_m=r), observation(0.1, range_m=r)) for r in (15.0, 32.0))
+    for c in (near, far):
+        c.add_log_ratios(MotionLogRatios(9.0, 4.0, 3.0, 7.0, 1.1, 1.2))
+    far.flight_log_ratio = 0.0
+    assert (named(near)["displaced_nats"], named(near)["displaced_m"]) == (7.0, 1.2)
+    assert named(far)["displaced_nats"] == NOT_DISPLACED_NATS
+    assert named(far)["displaced_m"] == pytest.approx(1.2 - lamp_sway_m(32.0))

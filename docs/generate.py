@@ -143,23 +143,20 @@ def _default(value: dict[str, Any]) -> str:
 def commands_page() -> str:
     """The help text of every command."""
     sys.path.insert(0, str(ROOT))
-    import typer
+    from links.cli.app import COMMANDS, command
 
-    from links.cli.app import app
-
-    group: Any = typer.main.get_command(app)
     lines = [
         "# Commands",
         "",
         "Exit codes: 0 success, 1 a finding, 2 wrong use. `grd COMMAND --help` prints the same.",
         "",
     ]
-    for name in sorted(group.commands):
-        command = group.commands[name]
-        help_text = re.sub(r"\n(?!\n)\s*", " ", (command.help or "").replace("\n\n", "\0")).replace("\0", "\n\n")
+    for name in sorted(COMMANDS):
+        shown: Any = command(name)
+        help_text = re.sub(r"\n(?!\n)\s*", " ", (shown.help or "").replace("\n\n", "\0")).replace("\0", "\n\n")
         lines += [f"## `grd {name}`", "", help_text.replace("Example: ", "Example:\n\n    "), ""]
         lines += ["| parameter | meaning |", "| --- | --- |"]
-        for parameter in command.params:
+        for parameter in shown.params:
             flags = ", ".join(getattr(parameter, "opts", [parameter.name]))
             meaning = (
                 (getattr(parameter, "help", None) or "")

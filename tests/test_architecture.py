@@ -150,7 +150,9 @@ def test_the_top_level_is_fixed():
 def test_the_committed_recordings_are_small():
     sizes = {file.name: file.stat().st_size for file in (ROOT / "recordings").glob("*.mcap")}
     assert sizes
-    assert sum(sizes.values()) < 40_000_000
+    assert (
+        sum(sizes.values()) < 60_000_000
+    )  # 30 s of all sensors at 5 Hz images, and each experiment until its pose is known
     assert sizes["street_sweep.mcap"] <= 3_000_000
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from links import __version__
-from links.cli.app import app
+from links.cli.app import COMMANDS
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENTS = sorted(
@@ -17,7 +17,6 @@ DOCUMENTS = sorted(
     for file in ROOT.glob(pattern)
 )
 GENERATED = {"settings.md", "commands.md", "operate.md", "hosts.md", "contribute.md", "recordings.md", "changelog.md"}
-COMMANDS = {command.name for command in app.registered_commands}
 
 
 def name_of(file):

@@ -87,18 +87,9 @@ def test_the_paper_baseline_detects_a_false_drone_in_that_room(tmp_path, mount):
     assert (results.sweeps, results.sweeps_with_drone) == (13, 13)
 
 
-@pytest.mark.parametrize(
-    ("number", "fixes", "states"),
-    [
-        (1, 0, ["SEARCHING", "TRACKING", "LOST", "SEARCHING"]),
-        (2, 36, ["SEARCHING", "TRACKING"]),
-        (3, 0, ["SEARCHING", "TRACKING", "LOST", "SEARCHING"]),
-        (4, 0, ["SEARCHING", "TRACKING", "LOST", "SEARCHING"]),
-    ],
-)
-def test_the_paper_baseline_fails_the_first_seconds_of_each_experiment(tmp_path, number, fixes, states):
-    """It detects something else as the drone, aims at it, and keeps it (2) or loses it."""
-    results, _, truth = run(tmp_path, f"experiment_{number}", "paper")
-    assert (results.sweeps, len(results.fixes)) == (1, fixes)
-    assert [t.state for t in results.transitions] == states
+def test_the_paper_baseline_fails_the_start_of_the_first_experiment(tmp_path):
+    """Aimed by its own method: it detects something else as the drone, aims at it, and loses it."""
+    results, _, truth = run(tmp_path, "experiment_1-paper", "paper_lidar")
+    assert results.sweeps >= 1
+    assert {t.state for t in results.transitions} >= {"TRACKING", "LOST"}
     assert all(np.linalg.norm(error) > 10 for error in fix_errors(results.fixes, *truth.drone_in_vehicle()).error_m)

@@ -1,56 +1,91 @@
 """The command line application `grd` and its commands.
 
+The module of a command is imported when the command is used: numba's compiled functions and Rerun take seconds.
+
 Source: ours.
 """
 
 from __future__ import annotations
 
-from typing import Annotated
+from importlib import import_module
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from links import __version__
-from links.cli.calibrate import calibrate_recording
-from links.cli.console import out
-from links.cli.evaluate import evaluate_runs
-from links.cli.files import import_recording, recover_recording, view
-from links.cli.graphs import check, graph, schema
-from links.cli.lens import import_lens
-from links.cli.preflight import preflight
-from links.cli.run import replay_recording, run
-from links.cli.simulate import fly_scenarios, simulate_matrix, simulate_recording
-from links.cli.verify import verify
-from links.training.command import train_detector
+
+# name: module and function in links.cli, beginning of the help
+COMMANDS = {
+    "run": ("run:run", "Run CONFIG live, or over the recording that its `replay:` names."),
+    "replay": ("run:replay_recording", "Replay RECORDING, deterministic and as fast as possible."),
+    "check": ("graphs:check", "Report all errors of CONFIG and of the hosts file."),
+    "graph": ("graphs:graph", "Draw the graph of CONFIG."),
+    "schema": ("graphs:schema", "Write the JSON Schema of the YAML files, for editors."),
+    "import": ("files:import_recording", "Convert a capture or a telemetry log to a recording."),
+    "info": (
+        "links.importing.command:info",
+        "Show what is in a file: kind, span, topics, and what an import makes of them.",
+    ),
+    "export": (
+        "links.importing.command:export",
+        "Write a recording or a run as a ROS 2 bag (MCAP) for RViz, Foxglove and ros2 bag play.",
+    ),
+    "recover": ("files:recover_recording", "Make a clean copy of a damaged recording."),
+    "simulate": ("simulate:simulate_recording", "Make a recording of a simulated flight."),
+    "matrix": ("simulate:simulate_matrix", "Make the recordings of the scenario matrix."),
+    "flights": ("simulate:fly_scenarios", "Fly scenarios in closed loop and write a table."),
+    "view": ("files:view", "Open a run in the Rerun viewer, or write a screenshot of it."),
+    "preflight": ("preflight:preflight", "Check LiDAR, servo, cameras, autopilot, clocks, parameters, axes and disk."),
+    "calibrate": ("calibrate:calibrate_recording", "Estimate the LiDAR's mount on its servo."),
+    "lens": ("lens:import_lens", "Write the lens in FILE as a rig file, to include in a configuration after its rig."),
+    "train-detector": (
+        "links.training.command:train_detector",
+        "Train the detector's model and score it on held-out runs.",
+    ),
+    "evaluate": ("evaluate:evaluate_runs", "Evaluate runs against truth."),
+    "verify": ("verify:verify", "Replay the committed recordings and compare their output hashes."),
+}
+
+
+class Commands(TyperGroup):
+    """Imports a command when it is asked for; lists all of them without an import."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Names in the order of `COMMANDS`."""
+        return [*COMMANDS, *super().list_commands(ctx)]
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """The command of this name; None when there is none."""
+        return command(cmd_name) if cmd_name in COMMANDS else super().get_command(ctx, cmd_name)
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """The list of commands in the help."""
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, text) for name, (_, text) in COMMANDS.items()])
+
+
+def command(name: str) -> Any:
+    """A command, after its module was imported."""
+    module, _, function = COMMANDS[name][0].partition(":")
+    one = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+    one.command(name)(getattr(import_module(module if "." in module else f"links.cli.{module}"), function))
+    return typer.main.get_command(one)
+
 
 app = typer.Typer(
     name="grd",
+    cls=Commands,
     help="Pose of a drone relative to a moving ground vehicle: run live, replay, check, simulate, evaluate.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-app.command("run")(run)
-app.command("replay")(replay_recording)
-app.command("check")(check)
-app.command("graph")(graph)
-app.command("schema")(schema)
-app.command("import")(import_recording)
-app.command("recover")(recover_recording)
-app.command("simulate")(simulate_recording)
-app.command("matrix")(simulate_matrix)
-app.command("flights")(fly_scenarios)
-app.command("view")(view)
-app.command("preflight")(preflight)
-app.command("calibrate")(calibrate_recording)
-app.command("lens")(import_lens)
-app.command("train-detector")(train_detector)
-app.command("evaluate")(evaluate_runs)
-app.command("verify")(verify)
 
 
 def _version(wanted: bool) -> None:
     if wanted:
-        out.print(f"grd {__version__}")
+        typer.echo(f"grd {__version__}")
         raise typer.Exit
 
 

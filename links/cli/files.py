@@ -28,7 +28,7 @@ def import_recording(
     file: Annotated[
         Path,
         typer.Argument(
-            help="A LiDAR's capture (.pcap), a MAVLink log (.tlog), or the beams of one LiDAR (.json, .csv)."
+            help="A capture (.pcap), a log (.tlog, .bin, .ulg), a ROS bag, or the beams of one LiDAR (.json, .csv)."
         ),
     ],
     out_file: Annotated[
@@ -46,16 +46,20 @@ def import_recording(
     sender: Annotated[
         str | None, typer.Option("--sender", help="IPv4 address of the LiDAR, if there are several.")
     ] = None,
+    mapping: Annotated[
+        Path | None, typer.Option("--map", help="Which topic of a ROS bag is what [default: guessed, `grd info`].")
+    ] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Convert a capture or a telemetry log to a recording.
+    """Convert a capture, a telemetry log or a ROS bag to a recording.
 
     An Ouster's metadata (.json) or the angle correction file of a Hesai XT (.csv) becomes a rig file with its model and
     its beams, to be included after your rig.
 
     Example: grd import flight.pcap -o flight.mcap --rig configs/rigs/standard.yaml
     """
-    from links.recording import import_file
+    from links.importing import import_file
+    from links.ros.mapping import read_mapping
 
     if file.suffix in BEAM_FILES:
         _import_beams(file, out_file, overwrite)
@@ -63,7 +67,14 @@ def import_recording(
     rig_yaml = None if rig is None else _upright_rig(rig) if rig.suffix in BEAM_FILES else read_rig(rig)
     with progress_bar(f"import {file.name}") as step:
         report = import_file(
-            file, out_file, rig_yaml=rig_yaml, port=port, sender=sender, overwrite=overwrite, progress=step
+            file,
+            out_file,
+            rig_yaml=rig_yaml,
+            port=port,
+            sender=sender,
+            mapping=None if mapping is None else read_mapping(mapping),
+            overwrite=overwrite,
+            progress=step,
         )
     for text in report.warnings:
         warn(text)
@@ -87,7 +98,7 @@ def _import_beams(file: Path, out_file: Path | None, overwrite: bool) -> None:
 
 def _upright_rig(file: Path) -> str:
     """The rig of a capture without a known mount, with the beams in a manufacturer's file."""
-    from links.recording.importing import DEFAULT_RIG
+    from links.importing.imported_file import DEFAULT_RIG
 
     lidar = _lidar_of(file)
     rig = yaml.safe_load(DEFAULT_RIG.format(model=lidar["model"]))
@@ -164,9 +175,27 @@ def _size(text: str) -> str:
     return text
 
 
+def _rrd_of(run: Path | None) -> Path:
+    """The .rrd file of a run; of None: of the newest run in out/. LinkError when there is none."""
+    if run is None:
+        found = sorted(Path("out").glob("*/*.rrd"), key=lambda file: file.stat().st_mtime)
+        if not found:
+            raise LinkError("out/ holds no run with a run.rrd: name the folder of a run, or: grd run quickstart")
+        out.print(f"the newest run: {found[-1]}", markup=False)
+        return found[-1]
+    if not run.is_dir():
+        return run
+    file = next(iter(sorted(run.glob("*.rrd"))), None)
+    if file is None:
+        raise LinkError(f"{run} holds no run.rrd: its configuration has no viewer (links.viewer.Viewer)")
+    return file
+
+
 @report_errors
 def view(
-    rrd: Annotated[Path, typer.Argument(help="The run.rrd of a run.")],
+    run: Annotated[
+        Path | None, typer.Argument(help="Folder of a run, or its run.rrd [default: the newest run in out/].")
+    ] = None,
     png: Annotated[
         Path | None,
         typer.Option("--screenshot", help="Write an image instead of opening a window (no display needed)."),
@@ -181,10 +210,11 @@ def view(
 
     With --screenshot the exit code is 1 when a view has errors.
 
-    Example: grd view out/street_sweep-replay/run.rrd --screenshot run.png
+    Example: grd view out/experiment_1-quickstart --screenshot run.png
     """
     from links.viewer import screenshot, show
 
+    rrd = _rrd_of(run)
     if png is None:
         if tab is not None:
             raise LinkError("--tab selects the tab of an image: add --screenshot FILE.png")

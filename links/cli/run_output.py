@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
 from rich.table import Table
 from rich.text import Text
 
@@ -14,6 +16,7 @@ from flow.graph import Graph
 from flow.live.report import LiveReport
 from links.cli.console import out, show_table, warn
 from links.clock import Clock
+from links.runs.fused_poses import FusedPoses
 from links.runs.request import RunResult
 from links.runs.results import FIX_FILE, POSE_FILE, SUMMARY_FILE, stamp_s
 from links.zenoh import Receiver, Sender
@@ -28,7 +31,9 @@ def print_result(run: RunResult) -> None:
     live = isinstance(report, LiveReport)
     for text in () if live else run.warnings:  # a live run has printed them already
         warn(text)
-    if results.fixes:
+    if run.poses is not None:
+        show_table(_pose_table(run, run.poses))
+    elif results.fixes:
         show_table(_fix_table(run))
     recorded_s = (report.last_ns - report.first_ns) / 1e9
     parts = f" in {run.parts} parts" if run.parts is not None and run.parts > 1 else ""
@@ -47,15 +52,8 @@ def print_result(run: RunResult) -> None:
     for change in results.transitions[-3:]:
         name = f"track {change.track_id}" if change.track_id > 1 else "tracker"
         out.print(f"{name} at {stamp_s(change.stamp_ns)} s: {change.state}, {change.reason}", markup=False)
-    if run.errors is not None and len(run.errors.stamps_ns):
-        x, y, z = run.errors.rmse_xyz_m
-        out.print(
-            f"errors against the truth: RMSE x/y/z {x:.3f} {y:.3f} {z:.3f} m, 3D {run.errors.rmse_m:.3f} m; "
-            f"truth inside the 95 % ellipsoid in {100 * run.errors.inside_95:.0f} % of fixes"
-        )
-    if results.pose_states:
-        states = ", ".join(f"{count} {state}" for state, count in results.pose_states.items())
-        out.print(f"fused poses: {states}; {results.resets} jumps")
+    for text in truth_texts(run):
+        out.print(text, markup=False)
     rejected = [
         f"{name}: {count} {reason}"
         for name, counters in report.counters.items()
@@ -66,7 +64,8 @@ def print_result(run: RunResult) -> None:
         out.print(f"rejected: {'; '.join(rejected)}", markup=False)
     if run.usage is not None and str(run.usage):
         out.print(f"used: {run.usage}")
-    out.print(f"output hash {run.output_hash}")
+    if run.output_hash is not None:
+        out.print(f"output hash {run.output_hash}")
     if not run.stage_outputs:
         out.print(f"positions   {run.out_dir / FIX_FILE}")
     if results.pose_states:
@@ -77,6 +76,69 @@ def print_result(run: RunResult) -> None:
     rerun_files = sorted(run.out_dir.glob("*.rrd"))
     for path in rerun_files:
         out.print(f"recording   {path}   (view: grd view {path})")
+
+
+def truth_texts(run: RunResult) -> list[str]:
+    """Errors of the LiDAR positions and of the fused poses, and how long each state lasted."""
+    texts: list[str] = []
+    if run.errors is not None and len(run.errors.stamps_ns):
+        x, y, z = run.errors.rmse_xyz_m
+        texts.append(
+            f"LiDAR positions, errors against the truth: RMSE x/y/z {x:.3f} {y:.3f} {z:.3f} m, 3D "
+            f"{run.errors.rmse_m:.3f} m; inside the 95 % ellipsoid {100 * run.errors.inside_95:.0f} %"
+        )
+    if run.results.pose_states:
+        states = ", ".join(f"{count} {state}" for state, count in run.results.pose_states.items())
+        texts.append(f"fused poses: {states}; {run.results.resets} jumps; {_first_full(run)}")
+    if run.poses is not None and run.poses.has_truth:
+        x, y, z = run.poses.rmse_xyz_m
+        distance_m = run.poses.distance_m
+        text = (
+            f"fused poses, errors against the truth: RMSE x/y/z {x:.3f} {y:.3f} {z:.3f} m, 3D "
+            f"{_rms(distance_m):.3f} m, largest {np.nanmax(distance_m):.2f} m; "
+            f"inside the 95 % ellipsoid {100 * run.poses.inside_95:.0f} %"
+        )
+        angle_deg = np.degrees(run.poses.angle_rad)
+        if np.isfinite(angle_deg).any():
+            text += f"; rotation RMSE {_rms(angle_deg):.2f} deg, largest {np.nanmax(angle_deg):.2f} deg"
+        texts.append(text)
+    return texts
+
+
+def _first_full(run: RunResult) -> str:
+    """When the whole pose was known for the first time, or why it never was."""
+    if run.poses is None or not run.poses.full.any():
+        return f"never FULL, at the end: {run.results.pose_reason}"
+    first_ns = int(run.poses.stamps_ns[run.poses.full][0])
+    return f"FULL after {(first_ns - run.report.first_ns) / 1e9:.1f} s"
+
+
+def _rms(values: NDArray[np.float64]) -> float:
+    return float(np.sqrt(np.nanmean(values**2)))
+
+
+def _pose_table(run: RunResult, poses: FusedPoses) -> Table:
+    """A table of at most TABLE_ROWS fused poses, evenly spaced; with columns of errors when the truth is known."""
+    rows = range(0, len(poses.state), max(1, -(-len(poses.state) // TABLE_ROWS)))
+    title = f"drone in the vehicle frame (forward, left, up), {len(rows)} of {len(poses.state)} fused poses"
+    table = Table(title=title, title_justify="left")
+    table.add_column("state")
+    heads = ["t [s]", "x [m]", "y [m]", "z [m]", "yaw [deg]", "sigma [m]", "sigma [deg]"]
+    for head in [*heads, *(["error [m]", "error [deg]"] if poses.has_truth else [])]:
+        table.add_column(Text(head), justify="right")
+    degrees = np.degrees([poses.yaw_rad, poses.sigma_rad, poses.angle_rad])
+    for row in rows:
+        elapsed_s = (int(poses.stamps_ns[row]) - run.report.first_ns) / 1e9
+        cells = [f"{elapsed_s:.2f}", *(f"{v:.2f}" for v in poses.xyz_m[row]), _number(degrees[0, row], 1)]
+        cells += [f"{poses.sigma_m[row]:.2f}", _number(degrees[1, row], 2)]
+        if poses.has_truth:
+            cells += [_number(poses.distance_m[row], 2), _number(degrees[2, row], 2)]
+        table.add_row(str(poses.state[row]), *cells)
+    return table
+
+
+def _number(value: float, digits: int) -> str:
+    return "-" if np.isnan(value) else f"{value:.{digits}f}"
 
 
 def _fix_table(run: RunResult) -> Table:

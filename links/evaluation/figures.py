@@ -147,6 +147,7 @@ def _over_time(e: Evaluation) -> Figure | None:
         panels += [(2.1, _draw_error)] if len(e.held) else []
         panels += [(1.5, draw) for draw in (_draw_axis("x", "forward"), _draw_axis("y", "left"), _draw_axis("z", "up"))
                    if len(e.errors)]  # fmt: skip
+    panels += [(1.5, _draw_yaw)] if _has_yaw_errors(e) else []
     panels += [(1.9, _draw_rotation)] if e.rotation_errors is not None and len(e.rotation_errors) else []
     panels += [(1.5, _draw_returns)] if e.run.target.returns_ns is not None or e.output.returns is not None else []
     panels += [(0.75 + 0.22 * lanes, _draw_states)] if lanes or e.held is not None else []
@@ -159,6 +160,11 @@ def _over_time(e: Evaluation) -> Figure | None:
         draw(axes, e)
     all_axes[-1].set(xlim=(0.0, e.duration_s), xlabel="time [s]")
     return figure
+
+
+def _has_yaw_errors(e: Evaluation) -> bool:
+    marks = e.output.has_rotation
+    return e.errors is not None and "yaw" in e.errors and marks is not None and bool(marks[e.errors.index].any())
 
 
 def _draw_error(axes: Axes, e: Evaluation) -> None:
@@ -178,23 +184,39 @@ def _draw_error(axes: Axes, e: Evaluation) -> None:
 
 
 def _draw_axis(axis: str, name: str) -> Callable[[Axes, Evaluation], None]:
-    """Signed error along an axis of the vehicle with the 3 sigma band of its covariance."""
+    """Signed error along an axis of the vehicle."""
 
     def draw(axes: Axes, e: Evaluation) -> None:
         assert e.errors is not None
         errors = e.errors.iloc[worst_of_each(e.errors.distance)]
-        t, error = _seconds(e, errors.stamp_ns), errors[axis].to_numpy()
-        beyond = np.zeros(len(error), dtype=np.bool_)
-        if "sigma" in errors:
-            band = 3 * errors[f"sigma_{axis}"].to_numpy()
-            axes.fill_between(t, -band, band, color=BAND, alpha=0.4, linewidth=0, label="3 sigma")
-            beyond = np.abs(error) > band
-        _points(axes, t[~beyond], error[~beyond], OUTPUT, "output - truth")
-        _points(axes, t[beyond], error[beyond], FALSE, "beyond 3 sigma", "x")
-        _compress(axes, e, error)
+        sigma = errors[f"sigma_{axis}"].to_numpy() if "sigma" in errors else None
+        _signed(axes, e, errors.stamp_ns, errors[axis].to_numpy(), sigma)
         _finish(axes, f"error along {axis} ({name})", y_label="error [m]")
 
     return draw
+
+
+def _draw_yaw(axes: Axes, e: Evaluation) -> None:
+    """Yaw error of the outputs whose rotation is known; sigma is that about the drone's z axis."""
+    assert e.errors is not None
+    assert e.output.has_rotation is not None
+    known = e.errors.loc[e.output.has_rotation[e.errors.index]]
+    errors = known.iloc[worst_of_each(known.yaw.abs())]
+    covariance = e.output.covariance
+    sigma = None if covariance is None else np.degrees(np.sqrt(covariance[errors.index, 2, 2]))
+    _signed(axes, e, errors.stamp_ns, np.degrees(errors.yaw.to_numpy()), sigma)
+    _finish(axes, "yaw error of the output", y_label="error [deg]")
+
+
+def _signed(axes: Axes, e: Evaluation, stamps_ns, error: Array64, sigma: Array64 | None) -> None:
+    """Signed errors with the 3 sigma band of their covariance."""
+    t, beyond = _seconds(e, stamps_ns), np.zeros(len(error), dtype=np.bool_)
+    if sigma is not None:
+        axes.fill_between(t, -3 * sigma, 3 * sigma, color=BAND, alpha=0.4, linewidth=0, label="3 sigma")
+        beyond = np.abs(error) > 3 * sigma
+    _points(axes, t[~beyond], error[~beyond], OUTPUT, "output - truth")
+    _points(axes, t[beyond], error[beyond], FALSE, "beyond 3 sigma", "x")
+    _compress(axes, e, error)
 
 
 def _draw_rotation(axes: Axes, e: Evaluation) -> None:

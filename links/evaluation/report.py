@@ -34,17 +34,24 @@ from links.evaluation.tables import (
 
 MAX_RUNS = 40  # runs with figures: a browser takes no larger file
 STYLE = """
-body{font:14px/1.45 system-ui,sans-serif;color:#223;background:#f6f7f9;margin:0 auto;max-width:1180px;padding:24px}
-h1{font-size:24px;margin:0 0 4px}h2{font-size:19px;margin:36px 0 6px;border-bottom:2px solid #223;padding-bottom:3px}
-h3{font-size:15px;margin:18px 0 4px}table{border-collapse:collapse;background:#fff;margin:8px 0;max-width:100%}
-th,td{padding:3px 7px;border:1px solid #dde2ea;text-align:right}
-th{font-size:12px;vertical-align:bottom;overflow-wrap:break-word}td.label{text-align:left;overflow-wrap:anywhere}
-tr.section td{background:#eef1f6;font-weight:600;text-align:left}.note{color:#667}
-.bad,tr.failed td,tr.worse td:last-child{color:#b01818}tr.better td:last-child{color:#1b7f4b}
+:root{color-scheme:light dark;--ink:#223;--page:#f6f7f9;--paper:#fff;--line:#dde2ea;--section:#eef1f6;--soft:#5b6475;
+--bad:#b01818;--good:#1b7f4b}
+body{font:14px/1.45 system-ui,sans-serif;color:var(--ink);background:var(--page);margin:0 auto;max-width:1180px;
+padding:24px;overflow-wrap:anywhere}
+h1{font-size:24px;margin:0 0 4px}h2{font-size:19px;margin:36px 0 6px;border-bottom:2px solid;padding-bottom:3px}
+h3{font-size:15px;margin:18px 0 4px}table{border-collapse:collapse;background:var(--paper);margin:8px 0;max-width:100%}
+th,td{padding:3px 7px;border:1px solid var(--line);text-align:right}
+th{font-size:12px;vertical-align:bottom}td{overflow-wrap:break-word}td.label{text-align:left;overflow-wrap:anywhere}
+tr.section td{background:var(--section);font-weight:600;text-align:left}.note{color:var(--soft)}
+.bad,tr.failed td,tr.worse td:last-child{color:var(--bad)}tr.better td:last-child{color:var(--good)}
 .cards{display:flex;gap:12px;flex-wrap:wrap}ul{margin:4px 0;padding-left:20px}
-.card{background:#fff;border:1px solid #dde2ea;border-radius:6px;padding:8px 14px;min-width:128px}
+.card{background:var(--paper);border:1px solid var(--line);border-radius:6px;padding:8px 14px;min-width:128px}
 .card b{display:block;font-size:20px}
 svg{background:#fff;border:1px solid #dde2ea;margin:4px 0;width:100%;height:auto}
+@media (prefers-color-scheme:dark){
+:root{--ink:#dde2ea;--page:#14171c;--paper:#1d2128;--line:#39404b;--section:#272d36;--soft:#9aa4b5;--bad:#ff8f8f;
+--good:#6fd39c}
+svg{filter:invert(.89) hue-rotate(180deg)}}
 """
 CARDS = (
     ("track_accuracy", "of the time accurate (within 1 m)"),

@@ -77,6 +77,7 @@ class RotationLog:
     R_vehicle_drone: Array64  # (n, 3, 3) of the published yaw branch; identity where there is none
     covariance_rad2: Array64  # (n, 3, 3) of phi in R exp(phi), drone axes; zero where there is none
     resolved: Flags  # (n,) the yaw branch is declared RESOLVED
+    decides: bool  # the stage decides the branch; False: it leaves it to the heading (state OPEN)
     switches: NDArray[np.int64]  # (n,) changes of the yaw branch so far
 
     def __len__(self) -> int:
@@ -308,13 +309,14 @@ def read_rotations(path: Path) -> RotationLog:
     table = TextTable(path, ("stamp_s", "accepted", *results.QUATERNION, *upper, "state", "switches"))
     accepted = table.equals("accepted", "1")
     resolved = table.equals("state", BranchState.RESOLVED.name, list(BranchState.__members__))
+    decides = not table.equals("state", BranchState.OPEN.name, list(BranchState.__members__)).any()
     quaternion = table.numbers(results.QUATERNION, accepted)
     quaternion[~accepted] = [0.0, 0.0, 0.0, 1.0]
     if not np.linalg.norm(quaternion, axis=1).all():
         raise LinkError(f"{path}: a quaternion is 0 0 0 0, which is not a rotation")
     R, covariance = rotations_from_xyzw(quaternion), table.symmetric(upper, accepted & table.filled(upper[0]))
     stamps_ns, switches = table.stamps_ns("stamp_s"), table.whole_numbers("switches")
-    return RotationLog(stamps_ns, accepted, R, covariance, resolved, switches)
+    return RotationLog(stamps_ns, accepted, R, covariance, resolved, decides, switches)
 
 
 def _check_overlap(run: RunData, truth: Trajectory) -> None:

@@ -34,6 +34,8 @@ PROBABILITY_EDGES = (0.0, 0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 0.95, 1.0)  # the detec
 FALSE_DETECTIONS = "false_detections_per_min"
 NO_SEARCH = "no complete search with a drone in reach"
 PUBLISHED, MODULO_90 = "rotation_published", "rotation_modulo_90"
+ANGLES = "rmse", "median", *(f"rmse_{axis}" for axis in EULER), "p95"
+OPEN_BRANCH = not_applicable("the stage leaves the yaw branch to the heading")
 FIRST_S, FIRST_M, FIRST_GROUND_M = "rotation_resolved_s", "rotation_resolved_m", "rotation_resolved_ground_m"
 
 
@@ -161,8 +163,11 @@ def camera_rotation(e: Evaluation) -> Value | None:
         e.remarks.append(
             "truth has no attitude of the vehicle: errors modulo 90 deg are about the vehicle's own z axis"
         )
-    _angle_statistics(e, log, PUBLISHED, errors.loc[:, [f"published_{name}" for name in ("angle", *EULER)]])
     _angle_statistics(e, log, MODULO_90, errors.loc[:, ["angle", *EULER]])
+    if not log.decides:
+        e.put_none(OPEN_BRANCH, *(f"{PUBLISHED}_{name}_deg" for name in ANGLES))
+        return _rotation_consistency(e, log, errors)
+    _angle_statistics(e, log, PUBLISHED, errors.loc[:, [f"published_{name}" for name in ("angle", *EULER)]])
     wrong = int((errors.resolved & (errors.published_angle > BRANCH_RAD)).sum())
     e.put("rotation_wrong_resolved", wrong, int(errors.resolved.sum()))
     if wrong:
@@ -173,7 +178,7 @@ def camera_rotation(e: Evaluation) -> Value | None:
 def _angle_statistics(e: Evaluation, log: RotationLog, prefix: str, errors_rad: pd.DataFrame) -> None:
     """RMSE, median, 95 % point and RMSE of the Euler angles [deg] of columns angle, roll, pitch, yaw."""
     n, (angle, *euler) = len(errors_rad), np.degrees(errors_rad.to_numpy()).T
-    keys = [f"{prefix}_{name}_deg" for name in ("rmse", "median", *(f"rmse_{axis}" for axis in EULER))]
+    keys = [f"{prefix}_{name}_deg" for name in ANGLES if name != "p95"]
     if n:
         e.put_all(dict(zip(keys, (rms(angle), np.median(angle), *map(rms, euler)), strict=True)), n)
     else:
@@ -210,6 +215,9 @@ def _first_resolved(e: Evaluation, log: RotationLog) -> None:
     errors, truth, vehicle = e.rotation_errors, e.run.truth, e.run.vehicle
     if e.span_ns is None:
         e.put_none(not_evaluated("the recording's time is not known"), *keys)
+        return
+    if not log.decides:
+        e.put_none(OPEN_BRANCH, *keys, "rotation_wrong_resolved")
         return
     if not log.resolved.any():
         e.put_none(failed("never RESOLVED"), *keys)

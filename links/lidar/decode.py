@@ -24,17 +24,17 @@ from stages.messages import LidarFirings
 
 
 class FiringRows:
-    """Collects the pulses of consecutive data packets into one LidarFirings message."""
+    """Collects the pulses of the consecutive data packets of a slice into one LidarFirings message."""
 
-    def __init__(self, form: AnyFormat, max_packets: int) -> None:
-        """`max_packets`: packets in a message."""
-        self._form = form
-        self._max_packets = max_packets
-        self._start()
+    def __init__(self, form: AnyFormat, slice_ns: int) -> None:
+        self._form, self._slice_ns = form, slice_ns
+        self.packets = 0
 
-    def _start(self) -> None:
+    def _start(self, packet_ns: int) -> None:
+        """Make room for the whole packets, at least one, whose duration is nearest to the slice's."""
+        self._max_packets = max(1, round(self._slice_ns / packet_ns))
         size = self._max_packets * self._form.max_rows
-        self.packets = self._count = self._stamp_ns = self._lost_packets = 0
+        self._count = 0
         self._rows = Rows(
             pulse_stamp_ns=np.empty(size, np.int64),
             laser=np.empty(size, np.uint8),
@@ -47,8 +47,8 @@ class FiringRows:
 
     @property
     def full(self) -> bool:
-        """Whether `max_packets` packets are in it."""
-        return self.packets == self._max_packets
+        """Whether the slice is complete."""
+        return self.packets > 0 and self.packets == self._max_packets
 
     def add(self, data: bytes, stamp_ns: int, lost_packets: int) -> bool:
         """Add every pulse of a packet that `reject_reason` accepts and whose first laser fired at stamp_ns.
@@ -60,6 +60,8 @@ class FiringRows:
         """
         form = self._form
         dual = form.return_mode(data) == "dual"
+        if self.packets == 0:
+            self._start(form.duration_ns(data))
         rows = decode(data, stamp_ns, dual, form.layout, form.scales, form.pulses, self._count, *self._rows)
         if rows == 0:
             return False
@@ -72,7 +74,8 @@ class FiringRows:
     def take(self) -> LidarFirings:
         """The message of all packets added since the previous call."""
         rows, count = self._rows, self._count
-        firings = LidarFirings(
+        self.packets = 0
+        return LidarFirings(
             stamp_ns=self._stamp_ns,
             pulse_stamp_ns=rows.pulse_stamp_ns[:count],
             laser=rows.laser[:count],
@@ -84,8 +87,6 @@ class FiringRows:
             lost_packets=self._lost_packets,
             laser_elevation_rad=self._form.elevation_rad,
         )
-        self._start()
-        return firings
 
 
 def compile_kernels() -> None:

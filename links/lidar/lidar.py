@@ -48,7 +48,7 @@ class LidarSettings(SourceSettings):
     sender: IPv4Address | None = None  # the LiDAR's address, 192.168.1.201 from the factory
     position_port: int | None = Field(None, ge=1, le=65535)  # 8308 from the factory; None: not received
     timeout_s: float = Field(2.0, gt=0, le=60)
-    packets: int = Field(1, ge=1, le=16)  # per message: fewer messages need less CPU time and add latency
+    slice_ms: float = Field(10.0, gt=0, le=50)  # of a message: longer ones need less CPU time and add latency
 
     @model_validator(mode="after")
     def _sender_is_known(self) -> LidarSettings:
@@ -68,14 +68,14 @@ class Lidar(Source[LidarSettings]):
         settings = self.settings
         clock = LidarClock(settings.clock, round(1e9 * settings.clock_limit_s))
         self.form = packet_format(settings.unit.model, settings.unit.beams)
-        self._stream = PacketStream(settings.topic, clock, self.form, settings.packets)
+        self._stream = PacketStream(settings.topic, clock, self.form, round(1e6 * settings.slice_ms))
         self._locked_once: bool = False  # clock: utc, since the start of `listen`: data packets are accepted
         self._position_s: float = 0.0  # arrival of the newest position packet, monotonic
         self._pps = PpsMonitor()
         self._udp = UdpCounters()
 
     def decode(self, record: Record) -> LidarFirings | None:
-        """Pulses of one packet, or of `packets` packets with the last of them; None before that, or when rejected.
+        """Pulses of a slice, with its last packet; None before that, or when the packet is rejected.
 
         Raises LinkError for another LiDAR model, or after 100 consecutive rejected packets.
         """
@@ -168,10 +168,10 @@ class Lidar(Source[LidarSettings]):
 class PacketStream:
     """Decodes packets in order and counts lost and rejected ones.
 
-    A message holds consecutive packets: a gap ends it early.
+    A message holds the consecutive packets of a slice, whole ones and at least one; a gap ends it early.
     """
 
-    def __init__(self, topic: str, clock: LidarClock, form: AnyFormat, packets_per_message: int = 1) -> None:
+    def __init__(self, topic: str, clock: LidarClock, form: AnyFormat, slice_ns: int) -> None:
         self.clock = clock
         self.decoded = 0
         self.lost = 0
@@ -180,7 +180,7 @@ class PacketStream:
         self._consecutive_rejected = 0
         self._lost_before = 0
         self._form, self._packet_ns = form, form.packet_ns("strongest")
-        self._packets_per_message, self._rows = packets_per_message, FiringRows(form, packets_per_message)
+        self._slice_ns, self._rows = slice_ns, FiringRows(form, slice_ns)
 
     def decode(self, record: Record) -> LidarFirings | None:
         """See `Lidar.decode`."""
@@ -196,7 +196,7 @@ class PacketStream:
         follows = abs(gap_ns - self._packet_ns) <= self._packet_ns // 2 and not self._lost_before
         lost = self._lost_before + max((gap_ns + self._packet_ns // 2) // self._packet_ns - 1, 0)
         self._packet_ns = form.duration_ns(data)
-        rows = self._rows if follows or not self._rows.packets else FiringRows(form, self._packets_per_message)
+        rows = self._rows if follows or not self._rows.packets else FiringRows(form, self._slice_ns)
         if not rows.add(data, stamp_ns, lost):
             self._lost_before = lost + 1
             return self._refuse(PacketRejectReason.AZIMUTH, data)

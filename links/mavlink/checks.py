@@ -23,15 +23,15 @@ from links.preflight.check_result import CheckResult, fail, ok, warning
 from links.preflight.link_checks import LinkChecks, declares
 from links.preflight.observations import Observation, Observations, ObservedSource
 from links.preflight.record_statistics import RecordStatistics
+from stages.heading.imu_buffer import CURRENT_NS
 from stages.messages import AutopilotEstimator, AutopilotStatus, RelativePose
-from stages.odometry.drone.trajectory import BRIDGED_NS
 
 MAV_AUTOPILOT = {"ardupilot": 3, "px4": 12}
 HEARTBEAT_GAP_S = 3.0
 WARN_LOSS, FAIL_LOSS = 0.01, 0.2  # share of frames
 WARN_MS, FAIL_MS = 10.0, 50.0  # clock uncertainty; at 5 m/s, 10 ms are 5 cm
 MIN_HZ, GOOD_HZ = 4.0, 10.0
-MAX_GAP_S = 1e-9 * BRIDGED_NS
+MAX_GAP_S = 1e-9 * CURRENT_NS
 WARN_RATIO = 0.5  # innovation test ratio; above 1 the EKF rejects the measurement
 LINK_HINT = "is the radio out of range, or too slow for the requested messages?"
 

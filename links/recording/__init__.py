@@ -2,7 +2,6 @@
 
 from links.recording.compressed_image import CompressedImage, decode_compressed_image, encode_compressed_image
 from links.recording.format import TOPICS, Progress, Topic
-from links.recording.importing import ImportReport, import_file
 from links.recording.reader import RecordingReader
 from links.recording.recorder import Recorder
 from links.recording.recover import RecoverReport, recover
@@ -12,7 +11,6 @@ from links.recording.writer import RecordingWriter
 __all__ = [
     "TOPICS",
     "CompressedImage",
-    "ImportReport",
     "Progress",
     "Recorder",
     "RecordingReader",
@@ -22,6 +20,5 @@ __all__ = [
     "Topic",
     "decode_compressed_image",
     "encode_compressed_image",
-    "import_file",
     "recover",
 ]

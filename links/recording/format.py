@@ -26,6 +26,7 @@ FORMAT_VERSION = (1, 0)  # a reader refuses a newer major; a minor only adds top
 METADATA_FORMAT = "grd"
 METADATA_USER = "recording"
 METADATA_LOSSES = "losses"
+TRUTH_POSES = ("/truth/vehicle", "/truth/drone")
 RIG_ATTACHMENT = "rig.yaml"
 CONFIG_ATTACHMENT = "config.yaml"
 

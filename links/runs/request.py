@@ -10,6 +10,7 @@ from pathlib import Path
 
 from flow.graph import Graph, load_graph
 from flow.replay import RunReport
+from links.runs.fused_poses import FusedPoses
 from links.runs.results import Results
 from links.runs.truth import FixErrors
 from links.runs.usage import Usage
@@ -40,8 +41,9 @@ class RunResult:
     out_dir: Path
     report: RunReport
     results: Results
-    errors: FixErrors | None  # None: the truth is not known
-    output_hash: str
+    errors: FixErrors | None  # of the LiDAR positions; None: the truth is not known
+    poses: FusedPoses | None  # None: no stage fuses, or no position was ever known
+    output_hash: str | None  # None: not computed
     wall_s: float
     warnings: list[str]
     usage: Usage | None = None  # of a live run

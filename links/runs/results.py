@@ -117,6 +117,7 @@ class Results(Tap[ResultsSettings]):
         self._state: dict[int, str] = {}  # of each track
         self._pose_state: PoseState | None = None
         self._pose_states: Counter[str] = Counter()
+        self._pose_reason: str = ""
         self._resets: int = 0
         self._branch: tuple[str, int] | None = None  # state and switches of the newest rotation
 
@@ -144,6 +145,11 @@ class Results(Tap[ResultsSettings]):
     def pose_states(self) -> dict[str, int]:
         """Number of poses in each state, most frequent first; empty without a fuse stage."""
         return dict(self._pose_states.most_common())
+
+    @property
+    def pose_reason(self) -> str:
+        """Why the newest pose has its state."""
+        return self._pose_reason
 
     @property
     def resets(self) -> int:
@@ -262,7 +268,7 @@ class Results(Tap[ResultsSettings]):
         whether the autopilot's gate accepts the pose at its own time.
         """
         self._pose_states[message.state.name] += 1
-        self._resets = message.resets
+        self._resets, self._pose_reason = message.resets, message.reason
         if message.state is not self._pose_state:
             self._pose_state = message.state
             self._log(message.stamp_ns, output, f"{message.state.name}: {message.reason}")

@@ -25,6 +25,7 @@ from flow.taps import Digest
 from links.lidar import Lidar, recorded_lidars
 from links.mavlink.autopilot import Autopilot
 from links.recording import Progress, Session
+from links.runs.fused_poses import read_fused_poses
 from links.runs.request import RunRequest, RunResult
 from links.runs.result_file import ResultFile
 from links.runs.results import SUMMARY_FILE, Results
@@ -95,7 +96,7 @@ class RunFolder:
     def finish(
         self,
         report: RunReport,
-        output_hash: str,
+        output_hash: str | None,
         truth: TruthLog | None,
         warnings: list[str],
         usage: Usage | None = None,
@@ -106,7 +107,7 @@ class RunFolder:
         `truth` None: read the file that a simulated rig wrote next to the recording; the rig is a tap and has ended.
         """
         warnings = [*warnings, *_remarks(self._graph, report)]
-        for text in (*warnings, f"output hash {output_hash}"):
+        for text in (*warnings, *([] if output_hash is None else [f"output hash {output_hash}"])):
             self.note(text)
         if truth is not None:
             for viewer in self._viewers:
@@ -121,6 +122,7 @@ class RunFolder:
             report=report,
             results=self._results,
             errors=truth.fix_errors_of(self._results.fixes),
+            poses=read_fused_poses(self._folder, truth),
             output_hash=output_hash,
             wall_s=time.monotonic() - self._started_s,
             warnings=warnings,
@@ -183,21 +185,23 @@ def replay_into(
     progress: Progress | None = None,
     *,
     single_process: bool = False,
+    hashed: bool = True,
 ) -> RunResult:
     """Replay a recording, all its parts, with its own rig when it has one. Raises ConfigError, LinkError, RunError.
 
-    `single_process`: ignore the subprocesses of the configuration.
+    `single_process`: ignore the subprocesses of the configuration. `hashed`: compute the output hash.
     """
     started_s = time.monotonic()
     session = Session(recording)
     graph = request.graph(session.rig_yaml, f"{recording} (rig.yaml)")
-    truth, digest = read_truth_file(recording), Digest()
+    truth, digest = read_truth_file(recording), Digest() if hashed else None
     clock_warnings = clock_differences(graph, session.config_yaml)
     with RunFolder(folder, recording, request, graph, started_s) as run:
         run_all = replay if single_process or not can_use_subprocesses() else replay_in_subprocesses
-        report = run_all(graph, truth.without_truth(session.records(progress=progress)), (digest, *run.taps))
-        warnings = [*session.warnings, *clock_warnings]
-        return run.finish(report, digest.hexdigest(), truth, warnings, parts=len(session.parts))
+        taps = run.taps if digest is None else (digest, *run.taps)
+        report = run_all(graph, truth.without_truth(session.records(progress=progress)), taps)
+        warnings, output_hash = [*session.warnings, *clock_warnings], None if digest is None else digest.hexdigest()
+        return run.finish(report, output_hash, truth, warnings, parts=len(session.parts))
 
 
 def clock_differences(graph: Graph, recorded_yaml: str | None) -> list[str]:

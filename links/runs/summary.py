@@ -9,9 +9,12 @@ import resource
 from dataclasses import asdict
 from typing import Any
 
+import numpy as np
+
 from flow.config.secrets import without_secrets
 from flow.live.report import LiveReport
 from links import __version__
+from links.runs.fused_poses import FusedPoses
 from links.runs.request import RunRequest, RunResult
 from links.runs.results import stamp_s
 from links.runs.truth import FixErrors
@@ -64,6 +67,8 @@ def summary(run: RunResult, request: RunRequest) -> dict[str, Any]:
         values["live"] = _live_values(report, run.usage) | ({} if run.usage is None else {"usage": run.usage.columns})
     if run.errors is not None:
         values["truth_errors"] = _truth_errors(run.errors)
+    if run.poses is not None and run.poses.has_truth:
+        values["pose_errors"] = _pose_errors(run.poses)
     return values
 
 
@@ -109,4 +114,18 @@ def _truth_errors(errors: FixErrors) -> dict[str, Any]:
         "rmse_3d_m": round(errors.rmse_m, 4),
         "mean_nees_of_3": round(float(errors.nees.mean()), 3),
         "inside_95_percent_ellipsoid": round(errors.inside_95, 4),
+    }
+
+
+def _pose_errors(poses: FusedPoses) -> dict[str, Any]:
+    """Errors of all fused poses with truth; of the rotation where it is known."""
+    angle_deg = np.degrees(poses.angle_rad[np.isfinite(poses.angle_rad)])
+    return {
+        "poses": int(np.isfinite(poses.distance_m).sum()),
+        "rmse_xyz_m": [round(float(v), 4) for v in poses.rmse_xyz_m],
+        "max_m": round(float(np.nanmax(poses.distance_m)), 4),
+        "rotations": len(angle_deg),
+        "rmse_deg": round(float(np.sqrt(np.mean(angle_deg**2))), 4) if len(angle_deg) else None,
+        "max_deg": round(float(angle_deg.max()), 4) if len(angle_deg) else None,
+        "inside_95_percent_ellipsoid": round(poses.inside_95, 4),
     }

@@ -83,6 +83,12 @@ class TruthLog:
             xyz[row] = R_world_vehicle.T @ (np.asarray(poses[stamp][0]) - np.asarray(t_vehicle))
         return np.array(stamps, dtype=np.int64), xyz
 
+    def rotation_in_vehicle(self, number: int = 1) -> NDArray[np.float64]:
+        """Rotations (n, 4) of a drone in the vehicle frame, x, y, z, w, at the stamps of `drone_in_vehicle`."""
+        poses = self.drones[number].pose if number in self.drones else {}
+        stamps = sorted(self.vehicle.keys() & poses.keys())
+        return np.array([_relative(self.vehicle[stamp][1], poses[stamp][1]) for stamp in stamps]).reshape(-1, 4)
+
     def fix_errors_of(self, fixes: Sequence[DroneFix]) -> FixErrors | None:
         """Errors of the fixes against the drone that their track follows; None when the truth has no drone."""
         numbers = [number for number, drone in sorted(self.drones.items()) if drone.pose]
@@ -118,10 +124,8 @@ class TruthLog:
 
     def _write_drone(self, folder: Path, number: int, drone: TrueDrone) -> None:
         lines = [f"# T_vehicle_drone, {FULL_POSE}, truth\n"]
-        for stamp, position in zip(*self.drone_in_vehicle(number), strict=True):
-            stamp_ns = int(stamp)
-            q = _relative(self.vehicle[stamp_ns][1], drone.pose[stamp_ns][1])
-            lines.append(tum_line(stamp_ns, position, q))
+        poses = zip(*self.drone_in_vehicle(number), self.rotation_in_vehicle(number), strict=True)
+        lines += [tum_line(int(stamp), position, tuple(q.tolist())) for stamp, position, q in poses]
         (folder / drone_file(TRUTH_FILE, number)).write_text("".join(lines), encoding="utf-8")
         if drone.return_ns is not None:
             returns = "".join(f"{stamp_s(stamp)}\n" for stamp in sorted(drone.return_ns))

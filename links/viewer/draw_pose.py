@@ -212,7 +212,7 @@ def relative_rotation(message: RelativeRotation, name: str, scene: ViewerScene) 
         yield log_entry(name, f"the published branch changed, switch {message.switches}: {message.reason}", "WARN")
     if scene.changed(f"log/{name}", state):
         text = f"{state}: {message.reason}" if message.reason else state
-        yield log_entry(name, text, "WARN" if message.state is not BranchState.RESOLVED else "INFO")
+        yield log_entry(name, text, "INFO" if message.state in (BranchState.RESOLVED, BranchState.OPEN) else "WARN")
     R = message.R_vehicle_drone
     if R is None:
         yield from drone_sphere(None)

@@ -41,6 +41,7 @@ _STATE_COLOURS = {
     "no directions": colours.NEUTRAL,
     "RESOLVED": colours.GOOD,
     "AMBIGUOUS": colours.COASTING,
+    "OPEN": colours.COASTING,
     "NONE": colours.NEUTRAL,
     "moves": colours.GOOD,
     "no motion": colours.NEUTRAL,

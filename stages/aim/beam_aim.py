@@ -39,7 +39,7 @@ from stages.geometry.rig_lidar import RigLidar
 from stages.messages import Candidates, LidarFirings, ServoGoal, ServoState, TrackState
 from stages.sweep.turntable import GearPlay
 
-RESULT_NS = 12_000_000  # from a pass to the detector's and tracker's output about it
+RESULT_NS = 20_000_000  # from a pass to the output about it: PASS_OVER_NS of the tracker, a slice, a servo period
 MIN_OBSERVATION_NS = 5_000_000
 INITIAL_PASS_S = 0.05  # first estimate of the time to the rotor's next pass
 INNER_RAD = math.radians(8.0)  # beams with a larger elevation are used only when others need much more movement

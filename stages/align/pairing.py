@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator
 
-from stages.messages import VanishingDirections
+from stages.messages import CameraMount, VanishingDirections
 
 KEPT = 16
 
@@ -61,3 +61,10 @@ class Pairing:
         if nearest is None or abs(nearest.stamp_ns - drone.stamp_ns) > self._furthest_ns:
             return None
         return nearest
+
+
+def of_mount(seen: VanishingDirections, camera_mount: CameraMount, port: str) -> VanishingDirections:
+    """The message itself, or an error if it is of the other camera."""
+    if seen.camera_mount is not camera_mount:
+        raise ValueError(f"input {port!r} got the directions of the {seen.camera_mount.value}: wire the other camera")
+    return seen

@@ -34,7 +34,7 @@ import numpy as np
 from pydantic import Field
 
 from flow.stage import Settings, Stage
-from stages.align.pairing import Pairing
+from stages.align.pairing import Pairing, of_mount
 from stages.align.paper_correction import CorrectionRule, MotionCorrection
 from stages.align.paper_filter import RotationFilter
 from stages.align.paper_match import angle_between_rad, match
@@ -105,12 +105,12 @@ class PaperAlign(Stage[PaperAlignSettings]):
 
     def on_vehicle(self, directions: VanishingDirections) -> Iterator[RelativeRotation]:
         """V_G."""
-        for pair in self._pairing.vehicle(_of(directions, CameraMount.VEHICLE, "vehicle")):
+        for pair in self._pairing.vehicle(of_mount(directions, CameraMount.VEHICLE, "vehicle")):
             yield self._align(*pair)
 
     def on_drone(self, directions: VanishingDirections) -> Iterator[RelativeRotation]:
         """Directions V_D. Yields one rotation for each drone image, once the nearest vehicle image is known."""
-        for pair in self._pairing.drone(_of(directions, CameraMount.DRONE, "drone")):
+        for pair in self._pairing.drone(of_mount(directions, CameraMount.DRONE, "drone")):
             yield self._align(*pair)
 
     def finish(self) -> Iterator[RelativeRotation]:
@@ -159,24 +159,11 @@ class PaperAlign(Stage[PaperAlignSettings]):
         )
 
     def _message(self, stamp_ns: int, R: Array64 | None, reason: str) -> RelativeRotation:
+        if R is None:
+            return RelativeRotation.none(stamp_ns, reason, self._switches)
         probability = np.full(4, 0.25)
         if self._corrected:
             probability = np.array([1.0 - self.settings.wrong_share] + [self.settings.wrong_share / 3] * 3)
         state = BranchState.RESOLVED if self._corrected else BranchState.AMBIGUOUS
-        return RelativeRotation(
-            stamp_ns=stamp_ns,
-            R_vehicle_drone=None if R is None else R.copy(),
-            covariance_rad2=None if R is None else self._filter.covariance[:3, :3].copy(),
-            branch_probability=probability,
-            state=BranchState.NONE if R is None else state,
-            switches=self._switches,
-            reason=reason,
-        )
-
-
-def _of(directions: VanishingDirections, camera_mount: CameraMount, port: str) -> VanishingDirections:
-    if directions.camera_mount is not camera_mount:
-        raise ValueError(
-            f"input {port!r} got the directions of the {directions.camera_mount.value}: wire the other camera"
-        )
-    return directions
+        covariance = self._filter.covariance[:3, :3].copy()
+        return RelativeRotation.one(stamp_ns, R.copy(), covariance, probability, state, self._switches, reason)

@@ -12,7 +12,8 @@ yaw between them: it is where they overlap best. Most streets cross at right ang
 ones of them: here the yaw is determined modulo 90 deg.
 
 Plain correlation would match the strongest street of one camera with the strongest of the other, even where these are
-different streets; the overlap does not.
+different streets; the overlap does not. Where streets have several angles it has several maxima: each is a match, with
+a probability.
 
 Source: ours, for P IV; DESIGN, Vision.
 """
@@ -33,6 +34,8 @@ BROAD_RAD = math.radians(4.0)  # lines with a larger azimuth sigma are not used
 LONG_RAD = 0.5  # bound of the weight of a line
 NEAR_BINS = 4  # directions this near to each other are the same
 DIRECTION_SHARE = 0.04  # share of all lines from which a direction has full weight
+LIKENESS_WEIGHT, NONE_LIKENESS = 9.0, 0.48  # see match_probabilities
+LEAST_NONE = 0.02  # probability that no match is right, at least
 
 
 @dataclass(frozen=True)
@@ -129,20 +132,12 @@ def _has_direction(p: Array64) -> Array64:
     return np.clip(nearby(p) / DIRECTION_SHARE - 0.3, 0.0, 1.0)
 
 
-def shared_directions(vehicle: Array64, drone: Array64, yaw_rad: float) -> int:
-    """Number of directions modulo 90 deg along which both cameras have at least 2 DIRECTION_SHARE of their lines."""
-    if vehicle.sum() <= 0 or drone.sum() <= 0:
-        return 0
-    both = np.minimum(nearby(folded(vehicle)), np.roll(nearby(folded(drone)), round(yaw_rad / BIN_RAD)))
-    return sum(1 for peak in peaks(both, 4 * NEAR_BINS * BIN_RAD) if peak.likeness > 2 * DIRECTION_SHARE)
-
-
 @dataclass(frozen=True)
 class Peak:
     """One yaw at which the spectra match, modulo 90 deg."""
 
     yaw_rad: float  # in [0, pi / 2)
-    likeness: float
+    likeness: float  # the overlap there
 
 
 def peaks(correlation: Array64, separation_rad: float) -> list[Peak]:
@@ -156,6 +151,17 @@ def peaks(correlation: Array64, separation_rad: float) -> list[Peak]:
         if all(abs(quarter_difference(position - other.yaw_rad)) >= separation_rad for other in found):
             found.append(Peak(float(position % (math.pi / 2)), float(correlation[k])))
     return found
+
+
+def match_probabilities(found: list[Peak]) -> Array64:
+    """Probability (n,) that each match is the right one; 1 - sum: that none is.
+
+    A softmax of the likenesses and of NONE_LIKENESS. Both constants maximise the likelihood of the true matches of 820
+    pairs of images of ten simulated flights in five kinds of scenes.
+    """
+    score = LIKENESS_WEIGHT * np.array([*(peak.likeness for peak in found), NONE_LIKENESS])
+    share = np.exp(score - score.max())
+    return (1.0 - LEAST_NONE) * share[:-1] / share.sum()
 
 
 def quarter_difference(angle_rad: float) -> float:

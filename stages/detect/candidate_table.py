@@ -70,7 +70,7 @@ class CandidateTable:
         return self._candidates[row] if row >= 0 else None
 
     def pass_throughs_of(
-        self, part: Slice, origin_m: Array64, now_ns: int, disc_m: float, most_variance: float
+        self, part: Slice, origin_m: Array64, disc_m: float, most_variance: float
     ) -> Iterator[tuple[Candidate, int, int, bool]]:
         """(candidate, returns from its middle, pulses that passed, whether it is outside the fan), of a slice.
 
@@ -79,8 +79,8 @@ class CandidateTable:
         """
         rows, pulses = len(self._candidates), part.pulses
         count = count_pulses(
-            self._state, self._ns, self._promising, rows, now_ns, part.R, part.t, part.axis, origin_m,
-            pulses.direction_vehicle, pulses.range_m, disc_m, most_variance, self._found,
+            self._state, self._ns, self._promising, rows, *part.first, *part.last, part.axis, part.half_rad, origin_m,
+            pulses.point_stamp_ns, pulses.direction_vehicle, pulses.range_m, disc_m, most_variance, self._found,
         )  # fmt: skip
         if not count:
             return

@@ -41,7 +41,7 @@ from stages.geometry.rig_lidar import RigLidar
 from stages.geometry.trajectory import VehicleTrajectory
 from stages.kernels.detect.candidate import SIGMA_M
 from stages.kernels.detect.candidate_table import first_within
-from stages.kernels.sweep.pulses import mean_unit_direction
+from stages.kernels.sweep.pulses import cone_of
 from stages.messages import (
     CandidateLog,
     Candidates,
@@ -162,9 +162,10 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
         now_ns = int(pulses.point_stamp_ns[-1])
         if now.start_ns is None:
             now.start_ns = now.pruned_ns = now.detector_instance = pulses.stamp_ns
-        part = Slice(pulses, *now.trail.at(pulses.middle_ns), mean_unit_direction(pulses.direction_vehicle))
+        ends = now.trail.at(pulses.stamp_ns), now.trail.at(now_ns)
+        part = Slice(pulses, *cone_of(pulses.direction_vehicle), *ends)
         changed = False
-        observations = now.finder.feed(part, self._motion_known(now_ns))
+        observations = now.finder.feed(part, now.trail, self._motion_known(now_ns))
         self._count_pass_throughs(now, part, now_ns)
         if now_ns - now.pruned_ns > PRUNE_PERIOD_NS:
             now.pruned_ns = now_ns
@@ -270,7 +271,7 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
         """Count the pulses that pass through a candidate's predicted position, scan pass by scan pass."""
         origin_m, disc_m = np.array(part.pulses.origin_vehicle_m), 0.22 * self.settings.span_m
         for c, returns, pass_throughs, outside in now.table.pass_throughs_of(
-            part, origin_m, now_ns, disc_m, (0.5 * self.settings.span_m) ** 2
+            part, origin_m, disc_m, (0.5 * self.settings.span_m) ** 2
         ):
             if not outside:
                 watch = now.watches.setdefault(c.number, _Watch())

@@ -37,16 +37,17 @@ class RecentPulses:
         self._fan = np.zeros((MAX_SLICES, 4))  # mean direction, and the largest angle of a pulse from it [rad]
         self._next = 0
 
-    def add(self, pulses: SweptPulses, axis: Array64, end_ns: int) -> None:
-        """Add a slice with its mean direction (3,) and the time of its last pulse; remove those before the window."""
+    def add(self, pulses: SweptPulses, axis: Array64, half_rad: float, end_ns: int) -> None:
+        """Add a slice with the cone around its directions and its last pulse's time; remove those before the window."""
         n, k = pulses.range_m.size, self._next
         missing = n - self._range_m.shape[1]
         if missing > 0:
             self._direction = np.pad(self._direction, ((0, 0), (0, missing), (0, 0)))
             self._range_m = np.pad(self._range_m, ((0, 0), (0, missing)))
         keep_slice(
-            pulses.direction_vehicle, pulses.range_m, np.array(pulses.origin_vehicle_m), axis, end_ns, k,
-            self._direction, self._range_m, self._origin_m, self._fan, self._sizes, self._end_ns,
+            pulses.direction_vehicle, pulses.range_m, np.array(pulses.origin_vehicle_m), axis, half_rad,
+            pulses.stamp_ns, end_ns, k, self._direction, self._range_m, self._origin_m, self._fan, self._sizes,
+            self._end_ns,
         )  # fmt: skip
         self._next = (k + 1) % MAX_SLICES
 

@@ -22,15 +22,15 @@ from stages.fuse.settings import FuseErrors
 from stages.geometry.frames import Array64
 from stages.geometry.se3 import CHI2_999_3, mahalanobis2
 from stages.geometry.trajectory import VehicleTrajectory
-from stages.heading import bank_measurements as measure
 from stages.heading.autopilot_samples import AutopilotSamples
 from stages.heading.earlier_run import EarlierRun
 from stages.heading.heading_memory import HeadingMemory
 from stages.heading.imu_buffer import ImuBuffer
 from stages.heading.inertial_heading import InertialHeading, bias_free_turn, turn_between
-from stages.heading.inertial_state import POSITION, THETA, InertialState
+from stages.heading.inertial_state import POSITION, InertialState
 from stages.heading.odometry_heading import OdometryHeading, OdomYaw
 from stages.heading.ownership import Ownership, log_evidence
+from stages.heading.rotation_answers import Answers, combine
 from stages.messages import DroneFix, DroneMotion, RelativeRotation, VisualMotion
 
 TILT_TIME_S = 20.0  # time constant of the error of roll and pitch
@@ -59,6 +59,7 @@ class Estimator:
         self.fix_ns: int | None = None  # newest LiDAR position used
         self.newest_fix_ns: int | None = None  # also when the drone is lost
         self.rotation_ns: int | None = None  # newest rotation by vanishing points used
+        self._cameras_confirmed = False  # the graph was started with confirmed answers of both cameras
         self.nis = math.nan
         self.bias_covariance_m2 = np.zeros((3, 3))
         self.rotation_bias_rad2 = np.zeros((3, 3))
@@ -185,7 +186,7 @@ class Estimator:
             self.rotation_ns = None
 
     def _to_bank(self) -> None:
-        """The IMU has ended: go on with the bank, from the graph's state."""
+        """Go on with the bank, from the graph's state: the IMU has ended, or cameras give their first answers."""
         self.heading.resume(self.graph.stamp_ns, self.graph.state)
         self.graph.stop()
 
@@ -254,7 +255,8 @@ class Estimator:
         self._add_vertical(self.heading.stamp_ns)
         self._add_ownership(stamp_ns, z, noise, self.heading.add_position(z, noise))
         self.heading.decide(self.is_own)
-        if self.decided and self.imu.is_current(stamp_ns):
+        if self.decided and self.imu.is_current(stamp_ns) and not self.heading.cameras_open:
+            self._cameras_confirmed = self.heading.cameras_confirmed
             self.graph.start(self.heading.stamp_ns, self.heading.decision())
             if self.graph.running:
                 self.heading.stop()
@@ -306,39 +308,38 @@ class Estimator:
                 self.heading.evidence = self.odometry.evidence(stamp_ns, own.R_odom_drone)
 
     def _use_rotation(self, rotation: RelativeRotation) -> None:
-        if rotation.R_vehicle_drone is None or rotation.covariance_rad2 is None or not self.known:
+        if not (len(rotation.answers) and self.known and self._vehicle.in_current_frame(rotation.stamp_ns)):
             return
-        if not self._vehicle.in_current_frame(rotation.stamp_ns):
-            return
-        stamp_ns, e = rotation.stamp_ns, self._errors
+        stamp_ns, bias_share = rotation.stamp_ns, self._errors.rotation_bias_share
         R_map_vehicle = self._vehicle.at(stamp_ns)[0]
-        R = R_map_vehicle @ rotation.R_vehicle_drone
-        white = (1.0 - e.rotation_bias_share) * rotation.covariance_rad2
+        white = (1.0 - bias_share) * rotation.covariances_rad2
+        answers = Answers(R_map_vehicle @ rotation.answers, white, rotation.probabilities, R_map_vehicle)
         factor = self._rotation_inflation.factor(stamp_ns)
+        if self.graph.running and not self._cameras_confirmed:
+            self._to_bank()
         if not self.graph.running:
             self.heading.advance(stamp_ns)
-            if (self.heading.add_rotation(stamp_ns, R, R_map_vehicle, factor * white) or 0.0) > 0.5:
-                self._rotation_used(rotation)
-            return
-        if abs(stamp_ns - self.graph.stamp_ns) > LATEST_NS:
+            used = (self.heading.add_rotation(stamp_ns, answers, 1.0 / factor) or 0.0) > 0.5
+        elif abs(stamp_ns - self.graph.stamp_ns) > LATEST_NS:
             self.too_late += 1
             return
-        graph = self.graph
-        dR, variance = turn_between(self.imu, stamp_ns, graph.stamp_ns, graph.state.bias[0])
-        covariance = dR.T @ (factor * white) @ dR + variance * np.eye(3)
-        off, nearest = (part[0] for part in measure.nearest_quarter(graph.state.R, R @ dR, R_map_vehicle))
-        if mahalanobis2(off, graph.state.covariance[0, THETA, THETA] + covariance) > CHI2_999_3:
-            if self._rejected_rotations.add(stamp_ns, off, covariance):
-                self.forget()
-            return
-        self._rejected_rotations.clear()
-        if graph.add_rotation(nearest, covariance):
-            self._rotation_used(rotation)
+        else:
+            used = self._add_rotation_to_graph(stamp_ns, answers, factor)
+        if used:
+            self.rotation_ns = stamp_ns
+            self.rotation_bias_rad2 = bias_share * rotation.covariances_rad2[0]
 
-    def _rotation_used(self, rotation: RelativeRotation) -> None:
-        assert rotation.covariance_rad2 is not None
-        self.rotation_ns = rotation.stamp_ns
-        self.rotation_bias_rad2 = self._errors.rotation_bias_share * rotation.covariance_rad2
+    def _add_rotation_to_graph(self, stamp_ns: int, answers: Answers, factor: float) -> bool:
+        """Add the answers as one rotation, its variance times `factor`. Whether it is in the estimate."""
+        graph = self.graph
+        turn = turn_between(self.imu, stamp_ns, graph.stamp_ns, graph.state.bias[0])
+        one = combine(graph.state, answers.turned(*turn))
+        if one.R_map_drone is None:
+            if self._rejected_rotations.add(stamp_ns, one.residual_rad, one.covariance_rad2):
+                self.forget()
+            return False
+        self._rejected_rotations.clear()
+        return graph.add_rotation(one.R_map_drone, factor * one.spread_rad2)
 
     def _use_visual_motion(self, motion: VisualMotion) -> None:
         if not self.graph.running:

@@ -58,11 +58,16 @@ class Intake:
         return self.is_valid(fix, "fix", *numbers) and self.is_covariance(fix.covariance_m2 - bias_m2, "fix")
 
     def is_valid_rotation(self, rotation: RelativeRotation) -> bool:
-        """Whether a rotation by cameras can be used; one without an estimate is not counted as rejected."""
-        R, covariance = rotation.R_vehicle_drone, rotation.covariance_rad2
-        if R is None or covariance is None:
+        """Whether the rotations by cameras can be used; a message without an answer is not counted as rejected."""
+        if not len(rotation.answers):
             return False
-        return self.is_valid(rotation, "rotation", R, covariance) and self.is_covariance(covariance, "rotation")
+        p, covariances = rotation.probabilities, rotation.covariances_rad2
+        if not self.is_valid(rotation, "rotation", rotation.answers, covariances, p):
+            return False
+        if not (p.min() > 0.0 and p.sum() <= 1.0 + 1e-9):
+            self.rejected["rotation: its probabilities are not positive with a sum of at most 1"] += 1
+            return False
+        return all(self.is_covariance(covariance, "rotation") for covariance in covariances)
 
     def is_valid_visual_motion(self, motion: VisualMotion) -> bool:
         """Whether a motion by the drone's camera can be used."""

@@ -10,7 +10,7 @@ import numpy as np
 from stages.geometry.frames import Array64
 from stages.kernels.geometry.so3 import hat
 
-CHI2_999_3 = 16.27  # 99.9 % quantile of chi-square with 3 degrees of freedom
+CHI2_999_2, CHI2_999_3 = 13.82, 16.27  # 99.9 % quantiles of chi-square with 2 and 3 degrees of freedom
 
 
 def adjoint(R: Array64, t: Array64) -> Array64:

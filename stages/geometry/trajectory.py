@@ -21,8 +21,8 @@ import numpy as np
 
 from stages.geometry.extrapolation import EXTRAPOLATION_S, LEAST_SPAN_NS, USUAL_MANEUVER, JumpGate, is_reachable
 from stages.geometry.frames import Array64
-from stages.kernels.geometry.so3 import exp_rotation, log_rotation, nearest_rotation, nearly_rotation
-from stages.kernels.geometry.trajectory import STEP_NS, to_map, to_vehicle
+from stages.kernels.geometry.so3 import log_rotation, nearest_rotation, nearly_rotation
+from stages.kernels.geometry.trajectory import STEP_NS, moved, to_map, to_vehicle
 from stages.messages import MotionStatus, VehicleMotion
 
 KEPT = 512  # poses
@@ -112,7 +112,8 @@ class VehicleTrajectory:
     def _append(self, motion: VehicleMotion) -> None:
         self._cache.clear()
         self._rates = None
-        self._poses.append((motion.stamp_ns, *self._in_map(motion)))
+        R, t = self._in_map(motion)
+        self._poses.append((motion.stamp_ns, np.ascontiguousarray(R), np.ascontiguousarray(t)))
 
     def _start_frame(self, first: VehicleMotion) -> None:
         """Begin a new start frame with this pose; earlier poses no longer contribute to the velocity."""
@@ -148,8 +149,7 @@ class VehicleTrajectory:
     def _beyond(self, seconds: float) -> tuple[Array64, Array64]:
         """R and t some seconds after the newest pose, with constant rates."""
         _, R, t = self._poses[-1]
-        turn_radps, velocity_mps = self._newest_rates()
-        return R @ exp_rotation(seconds * turn_radps), t + seconds * velocity_mps
+        return moved(R, t, *self._newest_rates(), seconds)
 
     def _newest_rates(self) -> tuple[Array64, Array64]:
         """Angular velocity (3,) [rad/s], vehicle axes, and velocity (3,) [m/s], map axes; zero if not observed."""
@@ -175,9 +175,7 @@ class VehicleTrajectory:
         if self.in_current_frame(stamp_ns):
             return self.at(stamp_ns)
         first_ns, R, t = next(pose for pose in self._poses if pose[0] >= self._frame_start_ns)
-        turn_radps, velocity_mps = self._newest_rates()
-        back_s = (stamp_ns - first_ns) * 1e-9
-        return R @ exp_rotation(back_s * turn_radps), t + back_s * velocity_mps
+        return moved(R, t, *self._newest_rates(), (stamp_ns - first_ns) * 1e-9)
 
     def rate_radps(self, stamp_ns: int) -> Array64:
         """Angular velocity (3,) in vehicle axes; zero where no pose gives it."""

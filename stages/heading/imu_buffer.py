@@ -14,7 +14,7 @@ import numpy as np
 from stages.geometry.frames import Array64
 from stages.heading.inertial_state import ImuIntervals, InertialState, predict, predict_free
 from stages.messages import DroneMotion, VisualMotion
-from stages.odometry.drone.trajectory import AutopilotTrajectory, VisualTrajectory, rotation_between
+from stages.odometry.drone.visual_trajectory import VisualTrajectory
 
 KEPT = 1024  # intervals: 20 s at 50 Hz
 HELD_NS = 150_000_000  # longest extrapolation with the newest interval's values
@@ -35,7 +35,7 @@ class ImuBuffer:
 
     def __init__(self) -> None:
         self._intervals: deque[DroneMotion] = deque(maxlen=KEPT)
-        self._images, self._no_autopilot = VisualTrajectory(), AutopilotTrajectory()
+        self._images = VisualTrajectory()
 
     @property
     def newest_ns(self) -> int | None:
@@ -102,11 +102,14 @@ class ImuBuffer:
         return state
 
     def _bridged(self, state: InertialState, gap: Gap) -> InertialState:
-        turn = rotation_between(self._no_autopilot, self._images, gap.from_ns, gap.to_ns)
-        variance, image_ns = turn.variance_rad2 if turn.measured else None, self._images.newest_ns
-        if turn.measured and image_ns is not None and gap.to_ns > image_ns:  # the newest turn is continued
+        turn, image_ns = self._images.between(gap.from_ns, gap.to_ns), self._images.newest_ns
+        seconds = (gap.to_ns - gap.from_ns) * 1e-9
+        if turn is None:
+            return predict_free(state, seconds, np.eye(3), None)
+        variance = turn.variance_rad2
+        if image_ns is not None and gap.to_ns > image_ns:  # the newest turn is continued
             variance = ((gap.to_ns - max(gap.from_ns, image_ns)) * 1e-9 * TURN_CHANGE_RADPS) ** 2
-        return predict_free(state, (gap.to_ns - gap.from_ns) * 1e-9, turn.R_from_to, variance)
+        return predict_free(state, seconds, turn.R_from_to, variance)
 
 
 def _row(m: DroneMotion, step_ns: int, force: float, rate: float) -> tuple[float, Array64, Array64, float, float]:

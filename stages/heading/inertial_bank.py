@@ -17,7 +17,8 @@ other by at most 0.0038 per axis (0.0019 RMS for each one, if independent), and 
 take-off. EKF3 assumes 0.0087 (0.5 deg/s) after a calibration. Too small a value makes a wrong yaw look certain.
 
 Source: Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation (2001), 11 (static multiple
-model), and PDA, 3.4 of Bar-Shalom and Li (1995), with one measurement; split: Faubel et al. (2009), 3 components.
+model), and PDA, 3.4 of Bar-Shalom and Li (1995), with one measurement; split: Faubel et al. (2009), 3 components;
+merging: Runnalls (2007), Kullback-Leibler approach to Gaussian mixture reduction, by the yaw.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ from stages.heading.inertial_state import (
     log_rotations,
 )
 
-STARTS, MOST = 12, 16
+STARTS, MOST = 12, 24
 START_TILT_RAD = math.radians(3.0)  # of the autopilot's roll and pitch
 START_YAW_RAD = 0.6 * 2 * math.pi / STARTS
 START_MPS = 4.0  # an unknown velocity, one axis
@@ -50,7 +51,7 @@ START_GYRO_BIAS = 0.005  # [rad/s] one axis, after the autopilot's calibration o
 WIDEST_YAW_RAD = math.radians(22.0)  # a hypothesis with a larger sigma is split
 SPLIT_SHARE, SPLIT_SHIFT, SPLIT_SIGMA = 0.2252, 1.0566, 0.6716
 DROPPED = 1e-8  # a less probable hypothesis is dropped
-ALIKE = 1.0  # squared distance of the yaws over their variances below which two hypotheses may be merged
+LOSS = 0.2  # of information [nat] below which two hypotheses may be merged, for each unit of their probability
 ALIKE_RAD = math.radians(3.0)
 NEAR_RAD = math.radians(20.0)
 LEAST_CANDIDATE = 0.05  # a less probable hypothesis is not the best one
@@ -79,6 +80,7 @@ class InertialBank:
 
     def __init__(self, state: InertialState, log_weight: Array64) -> None:
         self.state, self.log_weight = state, log_weight - _log_sum(log_weight)
+        self.tied = np.zeros(len(state), dtype=np.bool_)  # to an answer of both cameras (rotation_answers.py)
         self.log_evidence = 0.0  # log density of the newest measurement, outliers included
 
     @property
@@ -114,11 +116,16 @@ class InertialBank:
         self.log_weight = log_weight - self.log_evidence
         return float(self.weight @ beta)
 
+    def replace(self, state: InertialState, log_weight: Array64, tied: NDArray[np.bool_]) -> None:
+        """Other hypotheses, with log weights (n,) that need not be normalised."""
+        self.state, self.log_weight, self.tied = state, log_weight - _log_sum(log_weight), tied
+        self.tidy()
+
     def tidy(self) -> None:
         """Drop improbable hypotheses, split wide ones and merge those that agree."""
         keep = np.flatnonzero(self.log_weight > self.log_weight.max() + math.log(DROPPED))
         if len(keep) < len(self.log_weight):
-            self.state, self.log_weight = self.state.rows(keep), self.log_weight[keep]
+            self.state, self.log_weight, self.tied = self.state.rows(keep), self.log_weight[keep], self.tied[keep]
             self.log_weight -= _log_sum(self.log_weight)
         wide = np.sqrt(self.state.yaw_variance_rad2) > WIDEST_YAW_RAD
         if wide.any():
@@ -140,18 +147,21 @@ class InertialBank:
         rest = np.setdiff1d(np.arange(len(self.log_weight)), wide)
         self.state = joined([self.state.rows(rest), *parts])
         self.log_weight = np.concatenate([self.log_weight[rest], *(log_weight + share for share in shares)])
+        self.tied = np.concatenate([self.tied[rest], *[self.tied[wide]] * 3])
 
     def _merge_nearest(self) -> bool:
-        """Merge the two hypotheses whose yaws differ least, if they agree or there are too many."""
+        """Merge the two hypotheses that lose least by it, if they agree or there are too many."""
         n = len(self.log_weight)
         if n < 2:
             return False
-        yaw, variance = self.state.yaw_rad, self.state.yaw_variance_rad2
+        yaw, variance, weight = self.state.yaw_rad, self.state.yaw_variance_rad2, self.weight
         apart = np.abs(np.remainder(yaw[:, None] - yaw[None, :] + math.pi, 2 * math.pi) - math.pi)
-        cost = apart**2 / (variance[:, None] + variance[None, :])
-        cost[np.tril_indices(n)] = math.inf
-        merged = cost < ALIKE if n > STARTS else (cost < 0.1 * ALIKE) | ((apart < ALIKE_RAD) & (cost < ALIKE))
-        if n <= MOST and not merged.any():
+        a = weight[:, None] / (weight[:, None] + weight[None, :])
+        merged2 = a * variance[:, None] + (1 - a) * variance[None, :] + a * (1 - a) * apart**2
+        cost = 0.5 * (np.log(merged2) - a * np.log(variance[:, None]) - (1 - a) * np.log(variance[None, :]))
+        cost[np.tril_indices(n)] = cost[self.tied[:, None] != self.tied] = math.inf
+        merged = cost < LOSS if n > STARTS else (cost < 0.1 * LOSS) | ((apart < ALIKE_RAD) & (cost < LOSS))
+        if not np.isfinite(cost).any() or (n <= MOST and not merged.any()):
             return False
         i, j = np.unravel_index(int(np.argmin(np.where(merged, cost, cost + 1e6))), cost.shape)
         pair = np.array([i, j])
@@ -161,6 +171,7 @@ class InertialBank:
         log_weight = _log_sum(self.log_weight[pair])
         self.state = joined([self.state.rows(rest), one])
         self.log_weight = np.append(self.log_weight[rest], log_weight)
+        self.tied = np.append(self.tied[rest], self.tied[i])
         return True
 
     @property

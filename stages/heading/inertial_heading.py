@@ -21,10 +21,13 @@ from stages.heading.imu_buffer import ImuBuffer
 from stages.heading.inertial_bank import NEAR_RAD, InertialBank, YawMixture, start
 from stages.heading.inertial_state import POSITION, ImuIntervals, InertialState
 from stages.heading.odometry_heading import YawEvidence
+from stages.heading.rotation_answers import Answers, add_answers
 from stages.kernels.geometry.so3 import log_rotation
 from stages.messages import VisualMotion
 
 DECIDED, DECIDED_FOR_NS = 0.999, 800_000_000
+CONFIRMED = 0.99  # probability from which the answers of both cameras are taken as right
+DISAGREE = 8  # consecutive images that disagree with the earlier ones: another street
 LATE_NS = 500_000_000  # an older measurement is not used
 DIRECTION_NS = 400_000_000  # between directions of flight by images that count as independent
 LONGEST_TURN_NS = 300_000_000
@@ -43,6 +46,7 @@ class InertialHeading:
         self.decided = False  # whether the heading is known
         self.near_probability = 0.0  # of a yaw within 20 deg of the best one, at the newest LiDAR position
         self._direction_ns = 0
+        self._disagreed = 0  # consecutive images
 
     def start(
         self,
@@ -104,16 +108,26 @@ class InertialHeading:
         if self.bank is not None:
             measure.add_vertical(self.bank, up_drone, sigma_rad)
 
-    def add_rotation(
-        self, stamp_ns: int, R_map_drone: Array64, R_map_vehicle: Array64, covariance_rad2: Array64
-    ) -> float | None:
-        """Add a rotation by vanishing points; returns the probability that it is no outlier, or None: too old."""
-        late_s = self._late_s(stamp_ns)
-        if self.bank is None or late_s is None:
+    def add_rotation(self, stamp_ns: int, answers: Answers, share: float) -> float | None:
+        """Add rotations by cameras, of which `share` is new evidence. Returns P that one is right; None: too old."""
+        if self.bank is None or self._late_s(stamp_ns) is None:
             return None
-        dR, variance = self.turn(stamp_ns, self.stamp_ns)
-        covariance = dR.T @ covariance_rad2 @ dR + variance * np.eye(3)
-        return measure.add_rotation(self.bank, R_map_drone @ dR, R_map_vehicle, covariance)
+        right = add_answers(self.bank, answers.turned(*self.turn(stamp_ns, self.stamp_ns)), share)
+        self._disagreed = 0 if right > 0.5 else self._disagreed + 1
+        if self._disagreed >= DISAGREE or self.bank.weight[self.bank.tied].sum() < 1.0 - DECIDED:
+            self.bank.tied[:] = False
+            self._disagreed = 0
+        return right
+
+    @property
+    def cameras_confirmed(self) -> bool:
+        """Whether the drone's motion confirms the answers of both cameras."""
+        return self.bank is not None and float(self.bank.weight[self.bank.tied].sum()) > CONFIRMED
+
+    @property
+    def cameras_open(self) -> bool:
+        """Whether the answers of both cameras may be right or wrong."""
+        return self.bank is not None and bool(self.bank.tied.any()) and not self.cameras_confirmed
 
     def add_visual_motion(self, motion: VisualMotion) -> None:
         """Add a step of the drone's visual odometry that ended at the bank's time or shortly before."""

@@ -45,22 +45,70 @@ class BranchState(enum.Enum):
     NONE = 0  # no rotation available
     AMBIGUOUS = 1  # known up to multiples of 90 deg, or of 180 deg
     RESOLVED = 2
+    OPEN = 3  # known up to multiples of 90 deg; the stage leaves the branch to the heading
 
 
-@message(schema=42)
+@message(schema=91)
 class RelativeRotation(Message):
-    """R_vehicle_drone from both cameras, up to the 90 deg yaw ambiguity; stamp_ns is the images'. P IV.
+    """R_vehicle_drone by both cameras; stamp_ns is the images'. P IV.
 
-    Branch k adds a rotation of k * 90 deg about the vertical: Rz(k 90 deg) R_vehicle_drone where the vehicle is level.
-    `R_vehicle_drone` is branch 0, the most probable. 1 - sum(branch_probability): the probability that none is correct.
+    The lines of two images may match at several yaws. Each match is an answer, and leaves the yaw open by multiples of
+    90 deg: branch k of an answer is Rz(k 90 deg) R_vehicle_drone where the vehicle is level.
     """
 
-    R_vehicle_drone: Mat3 | None  # None: no rotation, `reason` states why
-    covariance_rad2: Mat3 | None  # of phi in R exp(phi), drone axes
-    branch_probability: Annotated[NDArray[np.float64], Shape(4)]  # of branch k
+    answers: Annotated[NDArray[np.float64], Shape("n", 3, 3)]  # R_vehicle_drone, most probable first; empty: none
+    covariances_rad2: Annotated[NDArray[np.float64], Shape("n", 3, 3)]  # of phi in R exp(phi), drone axes
+    probabilities: PerPointF64  # (n,) that an answer is right, on any branch; 1 - sum: that none is
+    branch_probability: Annotated[NDArray[np.float64], Shape(4)]  # of branch k of the first answer
     state: BranchState
     switches: int  # changes of the published branch since the start; each one is a jump
-    reason: str
+    reason: str  # what the answers rest on, or why there is none
+
+    @property
+    def R_vehicle_drone(self) -> Mat3 | None:
+        """Branch 0 of the most probable answer; None: no answer."""
+        return self.answers[0] if len(self.answers) else None
+
+    @property
+    def covariance_rad2(self) -> Mat3 | None:
+        """Covariance of the most probable answer; None: no answer."""
+        return self.covariances_rad2[0] if len(self.answers) else None
+
+    @staticmethod
+    def one(
+        stamp_ns: int,
+        R_vehicle_drone: Mat3,
+        covariance_rad2: Mat3,
+        branch_probability: NDArray[np.float64],
+        state: BranchState,
+        switches: int,
+        reason: str,
+    ) -> RelativeRotation:
+        """A message with a single answer."""
+        return RelativeRotation(
+            stamp_ns=stamp_ns,
+            answers=R_vehicle_drone[None],
+            covariances_rad2=covariance_rad2[None],
+            probabilities=branch_probability.sum(keepdims=True),
+            branch_probability=branch_probability,
+            state=state,
+            switches=switches,
+            reason=reason,
+        )
+
+    @staticmethod
+    def none(stamp_ns: int, reason: str, switches: int = 0) -> RelativeRotation:
+        """A message without an answer, with the reason."""
+        return RelativeRotation(
+            stamp_ns=stamp_ns,
+            answers=np.zeros((0, 3, 3)),
+            covariances_rad2=np.zeros((0, 3, 3)),
+            probabilities=np.zeros(0),
+            branch_probability=np.zeros(4),
+            state=BranchState.NONE,
+            switches=switches,
+            reason=reason,
+        )
 
 
 @message(schema=43)

@@ -33,7 +33,7 @@ def unproject(image: DepthImage, row: int, column: int) -> NDArray[np.float64]:
 
 
 class DepthCanvas:
-    """A depth image drawn packet by packet, so that the end of a sweep needs no extra computation."""
+    """A depth image drawn slice by slice, so that the end of a sweep needs no extra computation."""
 
     def __init__(self, size_px: int, fov_deg: float, origin_vehicle_m: NDArray[np.float64]) -> None:
         self._size_px = size_px
@@ -48,7 +48,7 @@ class DepthCanvas:
         self._points = self._returns = self._lost_packets = 0
 
     def draw(self, first_pulse_ns: int, xyz_vehicle_m: NDArray[np.float32], lost_packets: int) -> None:
-        """Add the returns (n, 3) of one packet."""
+        """Add the returns (n, 3) of one slice."""
         if self._start_ns is None:
             self._start_ns = first_pulse_ns
             lost_packets = 0  # lost before the sweep, not within it

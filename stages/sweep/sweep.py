@@ -1,6 +1,6 @@
-"""Sweep: LiDAR packets and servo angles to points in the vehicle frame, and a depth image at the end of each sweep.
+"""Sweep: LiDAR slices and servo angles to points in the vehicle frame, and a depth image at the end of each sweep.
 
-Packets wait in a queue until a servo state newer than their last pulse has arrived. Each return is then rotated by the
+Slices wait in a queue until a servo state newer than their last pulse has arrived. Each return is then rotated by the
 turntable angle at its own time (`stages/sweep/turntable.py`) and drawn into the depth image
 (`stages/sweep/depth_image.py`). The image is published when the turntable has travelled `sweep_deg` in one direction. A
 reversal or a gap in the servo states clears it, so vibration about a target never completes an image. A fixed LiDAR
@@ -17,7 +17,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
-import numpy as np
 from pydantic import Field, model_validator
 
 from flow.stage import Settings, Stage
@@ -43,7 +42,7 @@ class SweepSettings(Settings):
     reversal_deg: float = Field(0.5, gt=0, lt=30)
     min_range_m: float = Field(0.6, ge=0)  # nearer returns come from the sensor's mount
     max_servo_gap_s: float = Field(0.1, ge=0.005)  # longest gap between two servo states that is interpolated
-    max_wait_s: float = Field(0.34, gt=0)  # for a servo state; then the oldest packet is released without an angle
+    max_wait_s: float = Field(0.34, gt=0)  # for a servo state; then the oldest slice is released without an angle
 
     @model_validator(mode="after")
     def _settings_agree(self) -> SweepSettings:
@@ -53,7 +52,7 @@ class SweepSettings(Settings):
 
 
 class Sweep(Stage[SweepSettings]):
-    """Swept points and pulses per packet, a depth image per sweep. P III.A."""
+    """Swept points and pulses per slice, a depth image per sweep. P III.A."""
 
     optional_inputs: ClassVar[frozenset[str]] = frozenset({"servo"})
 
@@ -72,7 +71,7 @@ class Sweep(Stage[SweepSettings]):
             self._travel = Revolution()
 
     def on_firings(self, firings: LidarFirings) -> Iterator[SweptPoints | SweptPulses | DepthImage]:
-        """Queue the packet; yield what can be placed."""
+        """Queue the slice; yield what can be placed."""
         if firings.pulse_stamp_ns.size == 0:
             return
         waiting = self._waiting
@@ -82,12 +81,12 @@ class Sweep(Stage[SweepSettings]):
             yield from self._place(waiting.popleft())
 
     def on_servo(self, servo: ServoState) -> Iterator[SweptPoints | SweptPulses | DepthImage]:
-        """Add a servo state; yield the packets that waited for it."""
+        """Add a servo state; yield the slices that waited for it."""
         self._turntable.add(servo)
         yield from self._release()
 
     def finish(self) -> Iterator[SweptPoints | SweptPulses | DepthImage]:
-        """Yield the packets still queued, as far as their angle is known. An incomplete sweep gives no image."""
+        """Yield the slices still queued, as far as their angle is known. An incomplete sweep gives no image."""
         while self._waiting:
             yield from self._place(self._waiting.popleft())
 
@@ -105,22 +104,8 @@ class Sweep(Stage[SweepSettings]):
         first_ns, last_ns = int(pulse_ns[0]), int(pulse_ns[-1])
         turns = turntable.turns(pulse_ns)
         angle_rad = float(turns[-1, 0])
-        placed, pulses = turntable.place(firings, turns), turntable.pulses(firings, turns)
-        reason = ""
-        if placed.unplaced:
-            reason = turntable.why_unknown(last_ns if math.isnan(angle_rad) else first_ns)
-        yield SweptPoints(
-            stamp_ns=first_ns,
-            point_stamp_ns=pulse_ns[placed.pulse],
-            xyz_vehicle_m=placed.xyz_vehicle_m,
-            laser=firings.laser[placed.pulse],
-            reflectivity=firings.reflectivity[placed.pulse],
-            servo_rad=placed.turntable_rad,
-            pulses=int(np.count_nonzero(firings.return_kind == 0)),
-            origin_vehicle_m=pulses.origin_vehicle_m,
-            unplaced=placed.unplaced,
-            reason=reason,
-        )
+        points, pulses = turntable.place(firings, turns)
+        yield points
         yield pulses
         turntable.forget_before(last_ns)
         if math.isnan(angle_rad):
@@ -131,7 +116,7 @@ class Sweep(Stage[SweepSettings]):
         if travel.advance(angle_rad, azimuth_rad):
             canvas.clear()
         if travel.moving:
-            canvas.draw(first_ns, placed.xyz_vehicle_m, firings.lost_packets)
+            canvas.draw(first_ns, points.xyz_vehicle_m, firings.lost_packets)
         if travel.whole:
             yield canvas.take(last_ns, travel.turned_rad)
             travel.restart(angle_rad, azimuth_rad)

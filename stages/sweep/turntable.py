@@ -11,25 +11,15 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stages.geometry.frames import Array64, LidarMount
-from stages.kernels.sweep.turntable import place_pulses, place_returns, turns_at
-from stages.messages import LidarFirings, ServoState, SweptPulses
+from stages.kernels.sweep.turntable import Firings, Pulses, Returns, place_slice, turns_at
+from stages.messages import LidarFirings, ServoState, SweptPoints, SweptPulses
 
 STATES_KEPT = 512  # 5 s at 100 Hz: longer than any packet waits
-
-
-class Placed(NamedTuple):
-    """Returns of one packet in the vehicle frame."""
-
-    pulse: NDArray[np.int64]  # (n,) index of the pulse in the packet
-    xyz_vehicle_m: NDArray[np.float32]  # (n, 3)
-    turntable_rad: NDArray[np.float32]  # (n,)
-    unplaced: int
 
 
 class GearPlay:
@@ -61,14 +51,11 @@ class Turntable:
         self._min_range_m = min_range_m
         self._offset_ns = round(mount.servo_time_offset_s * 1e9)
         self.T_vehicle_turntable = mount.T_vehicle_turntable.matrix()
-        self._rows_vehicle_turntable: list[list[float]] = self.T_vehicle_turntable[:3].tolist()  # used per packet
         self._T_turntable_lidar = mount.T_turntable_lidar.matrix()
-        self._lidar_turntable_m: tuple[float, float, float] = tuple(self._T_turntable_lidar[:3, 3].tolist())
         self._last_servo_rad: float | None = None
         self._play = GearPlay(mount)
         self._states: deque[tuple[int, float]] = deque(maxlen=STATES_KEPT)
-        self._state_ns = np.empty(0, dtype=np.int64)
-        self._state_rad = np.empty(0)
+        self._arrays: tuple[NDArray[np.int64], Array64] | None = None  # the states; None: changed since
 
     @property
     def known_until_ns(self) -> int | None:
@@ -91,100 +78,92 @@ class Turntable:
         self._last_servo_rad = servo_rad
         angle_rad = self._mount.turntable_rad(servo_rad) - self._mount.servo_sign * self._play.lag_rad
         self._states.append((stamp_ns, angle_rad))
-        self._freeze()
+        self._arrays = None
 
     def forget_before(self, t_ns: int) -> None:
         """Drop states that no later pulse needs: all but the last one at or before t_ns."""
-        dropped = False
         while len(self._states) > 1 and self._states[1][0] <= t_ns:
             self._states.popleft()
-            dropped = True
-        if dropped:
-            self._freeze()
+            self._arrays = None
 
-    def _freeze(self) -> None:
-        self._state_ns = np.array([t for t, _ in self._states], dtype=np.int64)
-        self._state_rad = np.array([angle for _, angle in self._states])
-
-    def lidar_origin_vehicle_m(self, angle_rad: float) -> tuple[float, float, float]:
-        """Origin of the beams for a turntable angle; NaN counts as 0."""
-        angle_rad = 0.0 if math.isnan(angle_rad) else angle_rad
-        x, y, z = self._lidar_turntable_m
-        c, s = math.cos(angle_rad), math.sin(angle_rad)
-        x, y = c * x - s * y, s * x + c * y
-        a, b, c = self._rows_vehicle_turntable
-        return (
-            a[0] * x + a[1] * y + a[2] * z + a[3],
-            b[0] * x + b[1] * y + b[2] * z + b[3],
-            c[0] * x + c[1] * y + c[2] * z + c[3],
-        )
+    def _state_arrays(self) -> tuple[NDArray[np.int64], Array64]:
+        """Stamps and angles (n,) of the states."""
+        if self._arrays is None:
+            stamps_ns = np.array([t for t, _ in self._states], dtype=np.int64)
+            self._arrays = stamps_ns, np.array([angle for _, angle in self._states], dtype=np.float64)
+        return self._arrays
 
     def turns(self, pulse_ns: NDArray[np.int64]) -> Array64:
         """Angle, cosine and sine (n, 3) at each pulse; NaN where the angle is not known."""
         turn = np.empty((pulse_ns.size, 3))
         if self._mount.turns:
-            turns_at(pulse_ns, self._state_ns, self._state_rad, self._max_gap_ns, turn)
+            turns_at(pulse_ns, *self._state_arrays(), self._max_gap_ns, turn)
         else:
             turn[:] = 0.0, 1.0, 0.0
         return turn
 
-    def place(self, firings: LidarFirings, turns: Array64) -> Placed:
-        """The packet's returns in the vehicle frame; `turns`: as returned for its pulses."""
+    def place(self, firings: LidarFirings, turns: Array64) -> tuple[SweptPoints, SweptPulses]:
+        """The slice's returns and pulses in the vehicle frame; `turns`: as returned for its pulses.
+
+        A return without an angle is omitted and counted; pulses are empty unless the angle is known for all of them.
+        """
         n = firings.pulse_stamp_ns.size
-        pulse = np.empty(n, dtype=np.int64)
-        xyz_vehicle_m = np.empty((n, 3), dtype=np.float32)
-        turntable_rad = np.empty(n, dtype=np.float32)
-        placed, unplaced = place_returns(
-            firings.range_m,
-            firings.xyz_lidar_m,
+        returns = Returns(
+            stamp_ns=np.empty(n, np.int64),
+            xyz_m=np.empty((n, 3), np.float32),
+            laser=np.empty(n, np.uint8),
+            reflectivity=np.empty(n, np.uint8),
+            turntable_rad=np.empty(n, np.float32),
+        )
+        pulses = Pulses(
+            stamp_ns=np.empty(n, np.int64),
+            direction=np.empty((n, 3), np.float32),
+            range_m=np.empty(n, np.float32),
+            laser=np.empty(n, np.uint8),
+            reflectivity=np.empty(n, np.uint8),
+        )
+        placed, unplaced, count, fired, origin = place_slice(
+            Firings(
+                firings.pulse_stamp_ns,
+                firings.laser,
+                firings.azimuth_rad,
+                firings.range_m,
+                firings.reflectivity,
+                firings.return_kind,
+                firings.xyz_lidar_m,
+            ),
+            firings.laser_elevation_rad,
             turns,
             self._min_range_m,
             self.T_vehicle_turntable,
             self._T_turntable_lidar,
-            pulse,
-            xyz_vehicle_m,
-            turntable_rad,
+            returns,
+            pulses,
         )
-        return Placed(pulse[:placed], xyz_vehicle_m[:placed], turntable_rad[:placed], unplaced)
-
-    def pulses(self, firings: LidarFirings, turns: Array64) -> SweptPulses:
-        """All pulses of the packet in the vehicle frame; empty unless the angle is known for all of them."""
-        pulse_ns = firings.pulse_stamp_ns
-        n = pulse_ns.size
-        middle_rad = float(turns[n // 2, 0])
-        origin = self.lidar_origin_vehicle_m(middle_rad)
-        row = np.empty(n, dtype=np.int64)
-        direction_vehicle = np.empty((n, 3), dtype=np.float32)
-        distance_m = np.empty(n, dtype=np.float32)
-        count = place_pulses(
-            firings.return_kind,
-            firings.laser,
-            firings.azimuth_rad,
-            firings.range_m,
-            firings.xyz_lidar_m,
-            firings.laser_elevation_rad,
-            turns,
-            self.T_vehicle_turntable,
-            self._T_turntable_lidar,
-            np.array(origin),
-            row,
-            direction_vehicle,
-            distance_m,
+        first_ns, last_ns = int(firings.pulse_stamp_ns[0]), int(firings.pulse_stamp_ns[-1])
+        points = SweptPoints(
+            stamp_ns=first_ns,
+            point_stamp_ns=returns.stamp_ns[:placed],
+            xyz_vehicle_m=returns.xyz_m[:placed],
+            laser=returns.laser[:placed],
+            reflectivity=returns.reflectivity[:placed],
+            servo_rad=returns.turntable_rad[:placed],
+            pulses=fired,
+            origin_vehicle_m=origin,
+            unplaced=unplaced,
+            reason=self.why_unknown(last_ns if math.isnan(turns[-1, 0]) else first_ns) if unplaced else "",
         )
-        laser, reflectivity = firings.laser, firings.reflectivity
-        if count < n:  # otherwise each pulse has one row, in order, and the packet's arrays are used
-            row = row[:count]
-            pulse_ns, laser, reflectivity = pulse_ns[row], laser[row], reflectivity[row]
-        return SweptPulses(
-            stamp_ns=int(firings.pulse_stamp_ns[0]),
-            point_stamp_ns=pulse_ns,
-            direction_vehicle=direction_vehicle[:count],
-            range_m=distance_m[:count],
-            laser=laser,
-            reflectivity=reflectivity,
-            turntable_rad=middle_rad,
+        swept = SweptPulses(
+            stamp_ns=first_ns,
+            point_stamp_ns=pulses.stamp_ns[:count],
+            direction_vehicle=pulses.direction[:count],
+            range_m=pulses.range_m[:count],
+            laser=pulses.laser[:count],
+            reflectivity=pulses.reflectivity[:count],
+            turntable_rad=float(turns[n // 2, 0]),
             origin_vehicle_m=origin,
         )
+        return points, swept
 
     def why_unknown(self, t_ns: int) -> str:
         """The reason why the angle at a time is not known."""
@@ -195,6 +174,7 @@ class Turntable:
             return f"no servo state before the pulse; the first came {(first_ns - t_ns) / 1e9:.3f} s after it"
         if t_ns > last_ns:
             return f"no servo state after the pulse; the last came {(t_ns - last_ns) / 1e9:.3f} s before it"
-        after = int(np.searchsorted(self._state_ns, t_ns))
-        gap_s = (self._state_ns[after] - self._state_ns[after - 1]) / 1e9
+        state_ns, _ = self._state_arrays()
+        after = int(np.searchsorted(state_ns, t_ns))
+        gap_s = (state_ns[after] - state_ns[after - 1]) / 1e9
         return f"the servo was silent for {gap_s:.3f} s, allowed are {self._max_gap_ns / 1e9:.3f} s"

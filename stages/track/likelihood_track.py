@@ -25,7 +25,7 @@ from pydantic import Field
 from flow.stage import Settings, Stage
 from stages.geometry.frames import Array64, LidarMount
 from stages.geometry.trajectory import VehicleTrajectory
-from stages.kernels.sweep.pulses import mean_direction
+from stages.kernels.sweep.pulses import cone_of
 from stages.kernels.track.scan_pass import largest_sigma_m
 from stages.messages import (
     CandidateEvidence,
@@ -170,24 +170,9 @@ class LikelihoodTrack(Stage[LikelihoodTrackSettings]):
         if pulses.range_m.size == 0:
             return
         now_ns = int(pulses.point_stamp_ns[-1])
-        R, t = self._vehicle.at(pulses.middle_ns)
-        axis = mean_direction(pulses.direction_vehicle)
-        hypotheses, span_m, de_skew = self._hypotheses, self.settings.span_m, self.settings.de_skew
-        for track in hypotheses:
-            if track not in hypotheses:  # removed in this loop as a duplicate
-                continue
-            scan_pass = track.scan_pass
-            if scan_pass is not None and pulses.stamp_ns - scan_pass.last_ns > PASS_OVER_NS:
-                track.scan_pass = None
-                yield from self._close(track, scan_pass)
-            before = track.scan_pass
-            state = hypotheses.at(track, pulses.stamp_ns) if before is None else (before.x, before.P)
-            track.scan_pass = collect_into(before, pulses, R, t, axis, *state, span_m, de_skew)
-            if before is None:
-                track.pass_sample = hypotheses.sample(pulses.stamp_ns)
-            if track in hypotheses:
-                yield from self._publish_state(track, now_ns)
-        if not len(hypotheses) and now_ns - self._idle_ns > 500_000_000:
+        if len(self._hypotheses):
+            yield from self._follow(pulses, now_ns)
+        if not len(self._hypotheses) and now_ns - self._idle_ns > 500_000_000:
             self._idle_ns = now_ns
             yield TrackState(
                 stamp_ns=now_ns,
@@ -197,6 +182,25 @@ class LikelihoodTrack(Stage[LikelihoodTrackSettings]):
                 frame_s=0.5,
                 track_id=0,
             )
+
+    def _follow(self, pulses: SweptPulses, now_ns: int) -> Iterator[DroneFix | TrackState]:
+        """Update each hypothesis with a slice."""
+        hypotheses, span_m, de_skew = self._hypotheses, self.settings.span_m, self.settings.de_skew
+        ends_ns = (pulses.stamp_ns, now_ns) if de_skew else (pulses.middle_ns, pulses.middle_ns)
+        ends = self._vehicle.at(ends_ns[0]), self._vehicle.at(ends_ns[1])
+        cone = cone_of(pulses.direction_vehicle)
+        for track in hypotheses:
+            if track not in hypotheses:  # removed in this loop as a duplicate
+                continue
+            yield from self._close_before(track, pulses.stamp_ns)
+            before = track.scan_pass
+            state = hypotheses.at(track, pulses.stamp_ns) if before is None else (before.x, before.P)
+            track.scan_pass = collect_into(before, pulses, ends, cone, *state, span_m, de_skew)
+            if before is None:
+                track.pass_sample = hypotheses.sample(pulses.stamp_ns)
+            yield from self._close_before(track, now_ns)
+            if track in hypotheses:
+                yield from self._publish_state(track, now_ns)
 
     def _lose(self, track: Hypothesis, now_ns: int, why: str) -> Iterator[TrackState]:
         self._hypotheses.drop(track)
@@ -256,6 +260,13 @@ class LikelihoodTrack(Stage[LikelihoodTrackSettings]):
         )
 
     # one scan pass
+
+    def _close_before(self, track: Hypothesis, stamp_ns: int) -> Iterator[DroneFix | TrackState]:
+        """Evaluate the track's scan pass if its last pulse is PASS_OVER_NS before a time."""
+        scan_pass = track.scan_pass
+        if scan_pass is not None and stamp_ns - scan_pass.last_ns > PASS_OVER_NS:
+            track.scan_pass = None
+            yield from self._close(track, scan_pass)
 
     def _close(self, track: Hypothesis, scan_pass: ScanPass) -> Iterator[DroneFix | TrackState]:
         settings = self.settings

@@ -33,6 +33,8 @@ from stages.messages import SweptPulses
 from stages.track.hull import COLUMNS, WIDTH, across
 from stages.track.kalman import condition, measured
 
+Pose = tuple[Array64, Array64]  # R (3, 3), t (3,)
+
 MAX_OFFSET_M = 6.0  # from the prediction, of collected pulses
 RANGE_NOISE = 0.1  # one sigma of a return's depth about the drone's centre, over the span
 RANGE_FLOOR_M = 0.02
@@ -47,7 +49,7 @@ class ScanPass:
     """Pulses of one passing of the rotor, and the predicted state that they are measured from."""
 
     start_ns: int
-    last_ns: int
+    last_ns: int  # newest of its pulses
     x: Array64  # (6,) predicted at start_ns, frame map
     P: Array64
     line: Array64  # unit line of sight, frame map
@@ -75,9 +77,8 @@ class PassUpdate(NamedTuple):
 def collect_into(
     scan_pass: ScanPass | None,
     pulses: SweptPulses,
-    R: Array64,
-    t: Array64,
-    axis: Array64,
+    ends: tuple[Pose, Pose],
+    cone: tuple[Array64, float],
     x: Array64,
     P: Array64,
     span_m: float,
@@ -85,16 +86,20 @@ def collect_into(
 ) -> ScanPass | None:
     """The scan pass with this slice's pulses near the drone added; a new one if it was None; None without pulses.
 
-    R, t are T_map_vehicle of the slice, `axis` (3,) its mean direction; x, P the state predicted at the pass's start.
+    `ends` are T_map_vehicle at the slice's first and last pulse, `cone` axis and half angle of its directions; x, P the
+    state predicted at the pass's start. In the vehicle frame the drone moves linearly within the slice.
     """
     origin = np.array(pulses.origin_vehicle_m)
-    away, range_m, here = line_of_sight(R, t, origin, x, axis)
-    if not here:
-        return scan_pass
     start_ns = pulses.stamp_ns if scan_pass is None else scan_pass.start_ns
+    after_s = (pulses.stamp_ns - start_ns) * 1e-9 if de_skew else 0.0
+    span_s = int(pulses.point_stamp_ns[-1] - pulses.stamp_ns) * 1e-9 if de_skew else 0.0
     sigma_m = largest_sigma_m(P)
     gate_m = min(0.6 * span_m + 3.0 * sigma_m, MAX_OFFSET_M)
-    line = R @ away / range_m if scan_pass is None else scan_pass.line
+    reach_m = gate_m + LONGEST * span_m
+    away, velocity, R, here = line_of_sight(*ends[0], *ends[1], origin, x, after_s, span_s, *cone, reach_m)
+    if not here:
+        return scan_pass
+    line = R @ away / math.sqrt(away @ away) if scan_pass is None else scan_pass.line
     found = np.empty((pulses.range_m.size, COLUMNS))
     count = collect(
         pulses.point_stamp_ns,
@@ -103,9 +108,9 @@ def collect_into(
         pulses.laser,
         origin,
         away + origin,
-        R.T @ x[3:] if de_skew else np.zeros(3),
+        velocity,
         start_ns,
-        gate_m + LONGEST * span_m,
+        reach_m,
         0.5 + 3.0 * sigma_m,
         R.T @ line,
         across(line) @ R,  # horizontal in frame map, as in `evaluate`
@@ -116,7 +121,7 @@ def collect_into(
     if scan_pass is None:
         scan_pass = ScanPass(start_ns, start_ns, x, P, line, gate_m)
     scan_pass.parts.append(found[:count])
-    scan_pass.last_ns = int(pulses.point_stamp_ns[-1])
+    scan_pass.last_ns = start_ns + round(float(found[count - 1, DELAY_S]) * 1e9)
     return scan_pass
 
 

@@ -8,6 +8,9 @@ On the drone, gravity is the autopilot's tilt. Without it, gravity is the mount'
 point is corrected to the exposure of the middle row with the angular rate of the mount: `tilt` on the drone,
 `motion` on the vehicle. An image without enough straight lines gives no directions, and a reason.
 
+`min_direction_score`, `min_elsewhere_score` and `least_sigma_deg` were chosen on renders of three real panoramas; a
+fourth was kept back: tests/benchmarks/bench_vp_panoramas.py.
+
 Source: ours, for P IV and V.C; DESIGN, The graph: vp.
 """
 
@@ -60,7 +63,9 @@ class GreatCircleVpSettings(Settings):
     max_frames: int = Field(3, ge=1, le=6)  # horizontal pairs; 1: Manhattan
     min_lines: int = Field(4, ge=2)  # of a horizontal pair
     min_score: float = Field(7.0, gt=0)  # in standard deviations above lines of random directions
-    least_sigma_deg: float = Field(0.1, gt=0, le=5)  # lower limit of a direction's sigma
+    min_direction_score: float = Field(2.0, ge=-100)  # of each direction of a further pair, in the same units
+    min_elsewhere_score: float = Field(4.0, ge=-100)  # of a further pair without the lines of any 90 deg of azimuth
+    least_sigma_deg: float = Field(0.15, gt=0, le=5)  # beyond that of the lines: buildings are not exactly square
 
     @model_validator(mode="after")
     def _settings_agree(self) -> GreatCircleVpSettings:
@@ -141,6 +146,8 @@ class GreatCircleVp(Stage[GreatCircleVpSettings]):
             settings.max_frames,
             settings.min_lines,
             settings.min_score,
+            settings.min_direction_score,
+            settings.min_elsewhere_score,
         )
 
     def _message(

@@ -17,7 +17,7 @@ from stages.geometry.lens import Array64
 from stages.kernels.vp.directions import all_directions, upright
 from stages.kernels.vp.spectrum import APART_RAD
 from stages.vp.directions import Lines, Structure, assign, refine, residual_sigma
-from stages.vp.spectrum import peaks, wrap_90deg, yaw_spectrum
+from stages.vp.spectrum import pair_support, peaks, wrap_90deg, yaw_spectrum
 from stages.vp.verticals import propose_verticals, refine_vertical
 
 BINS = 180  # of the yaw spectrum: 0.5 deg each
@@ -30,6 +30,7 @@ TRIAL_ITERATIONS = 4
 RIVAL_RAD = math.radians(3.0)  # a vertical farther than this from the best one is a rival
 RIVAL_SHARE = 0.85  # a rival with more than this share of the best agreement makes the result ambiguous
 MIN_DIRECTION_LINES = 2  # of a horizontal direction
+MAX_REJECTED = 3  # further pairs that are tried in vain
 
 
 @dataclass(frozen=True)
@@ -51,6 +52,8 @@ class SearchLimits:
     max_frames: int
     min_lines: int
     min_score: float
+    min_direction_score: float
+    min_elsewhere_score: float
 
 
 @dataclass(frozen=True)
@@ -112,27 +115,38 @@ def _along_vertical(lines: Lines, vertical: Array64, limits: SearchLimits) -> ND
 def _frames(lines: Lines, axes: Array64, limits: SearchLimits) -> tuple[list[float], float]:
     """Yaws of the significant horizontal pairs relative to `axes`, the axes of the best pair.
 
-    Also returns the highest score of the spectrum.
+    Also returns the score of the first. A further pair must stand out without the lines of any 90 deg of azimuth, in
+    which a board, a car or a shelf lies; and each of its directions by itself: shadows and hoses have only one.
     """
     free = ~_along_vertical(lines, axes[:, 2], limits)
     yaws: list[float] = []
-    highest = 0.0
-    for _ in range(limits.max_frames):
+    rejected: list[float] = []
+    first_score = 0.0
+    while len(yaws) < limits.max_frames and len(rejected) < MAX_REJECTED:
         spectrum = yaw_spectrum(lines, axes, free, limits.sigma_model, BINS)
         allowed = np.ones(BINS, dtype=np.bool_)
-        for yaw in yaws:
+        for yaw in yaws + rejected:
             allowed &= np.abs(wrap_90deg(spectrum.yaw_rad - yaw)) > APART_RAD
         if not yaws:  # the first pair lies along the given axes
             allowed = np.abs(wrap_90deg(spectrum.yaw_rad)) < APART_RAD / 2
         peak = int(np.argmax(np.where(allowed, spectrum.score, -np.inf)))
-        highest = max(highest, float(spectrum.score[peak]))
-        near = _near(lines, axes, float(spectrum.yaw_rad[peak]) if yaws else 0.0, limits) & free
+        yaw, score = float(spectrum.yaw_rad[peak]) if yaws else 0.0, float(spectrum.score[peak])
+        first_score = first_score if yaws else score
+        near = _near(lines, axes, yaw, limits) & free
         more = FURTHER_SCORE if yaws else 0.0
-        if spectrum.score[peak] < limits.min_score + more or near.sum() < limits.min_lines * (1.5 if yaws else 1.0):
+        if score < limits.min_score + more or near.sum() < limits.min_lines * (1.5 if yaws else 1.0):
             break
-        yaws.append(float(spectrum.yaw_rad[peak]) if yaws else 0.0)
+        if yaws and not _stands_out(lines, axes, free, yaw, limits):
+            rejected.append(yaw)
+        else:
+            yaws.append(yaw)
         free = free & ~near
-    return yaws, highest
+    return yaws, first_score
+
+
+def _stands_out(lines: Lines, axes: Array64, free: NDArray[np.bool_], yaw: float, limits: SearchLimits) -> bool:
+    direction_score, elsewhere_score = pair_support(lines, axes, free, limits.sigma_model, yaw)
+    return direction_score >= limits.min_direction_score and elsewhere_score >= limits.min_elsewhere_score
 
 
 def _near(lines: Lines, axes: Array64, yaw: float, limits: SearchLimits) -> NDArray[np.bool_]:

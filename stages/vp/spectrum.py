@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.geometry.lens import Array64
-from stages.kernels.vp.spectrum import peaks_kernel, spread
+from stages.kernels.vp.spectrum import peaks_kernel, spread, support
 from stages.vp.directions import Lines
 
 
@@ -43,6 +43,22 @@ def yaw_spectrum(lines: Lines, axes: Array64, free: NDArray[np.bool_], sigma_mod
         middles,
     )
     return Spectrum(middles, (total - mean) / math.sqrt(max(variance, 1e-12)), total)
+
+
+def pair_support(
+    lines: Lines, axes: Array64, free: NDArray[np.bool_], sigma_model: float, yaw_rad: float
+) -> tuple[float, float]:
+    """Score of the weaker direction of a horizontal pair, and lowest score of the pair without a 90 deg sector."""
+    return support(
+        lines.normal,
+        lines.tangent,
+        lines.sigma_rad,
+        lines.weight,
+        np.ascontiguousarray(axes),
+        free,
+        2.0 * sigma_model,
+        yaw_rad,
+    )
 
 
 def peaks(spectrum: Spectrum, max_peaks: int) -> list[float]:

@@ -1,4 +1,4 @@
-"""Time per pair of pictures and per window: `python -m pytest tests/benchmarks/bench_align.py`. Goal: 3 ms a pair, one core.
+"""Time per pair of pictures: `python -m pytest tests/benchmarks/bench_align.py`. Goal: 3 ms a pair, one core.
 
 Side by side: our joint alignment and the paper's smallest-angle matching on the same messages, and the parts of ours.
 """
@@ -13,12 +13,14 @@ import pytest
 from stages.align import JointAlign, PaperAlign
 from stages.align.refine import Tolerances, refine, street_directions
 from stages.align.spectra import level_lines, overlap, peaks, spectrum
-from stages.heading.hypothesis_bank import DIRECTIONS, BranchSettings, Displacement, HypothesisBank
+from stages.geometry.frames import rotation_z
+from stages.heading.inertial_bank import start
+from stages.heading.rotation_answers import Answers, add_answers
 from stages.messages import CameraMount
-from tests.stages.align.made_joint_flight import START_NS, S
 from tests.stages.align.made_lines import ATLANTA, MANHATTAN, MS, seen, turned
 
 STREETS = {"manhattan, 80 lines": (MANHATTAN, 20), "atlanta, 300 lines": (ATLANTA, 60)}
+START_NS = 100_000_000_000
 STRAIGHT = math.radians(0.25)
 ALLOWED = Tolerances(STRAIGHT, math.radians(0.1), math.radians(0.5), math.radians(0.05))
 
@@ -70,8 +72,19 @@ def test_refinement(benchmark, name):
     benchmark(refine, *lines, street_directions(a, b, yaw), yaw, ALLOWED)
 
 
-def test_a_window_of_motion(benchmark):
-    bank = HypothesisBank(BranchSettings())
-    displacement = np.array([0.5, 0.1])
-    window = Displacement(S, 2 * S, np.tile(displacement, (DIRECTIONS, 1)), 0.01 * np.eye(2), displacement, 0.03, True)
-    benchmark(bank.see, window)
+@pytest.mark.parametrize("answers", [1, 3])
+def test_the_answers_of_a_pair_in_the_bank(benchmark, answers):
+    yaws = np.radians([10.0, 45.0, 70.0])[:answers]
+    made = Answers(
+        np.array([rotation_z(yaw) for yaw in yaws]),
+        np.tile(3e-5 * np.eye(3), (answers, 1, 1)),
+        np.full(answers, 0.9 / answers),
+        np.eye(3),
+    )
+
+    def bank():
+        one = start(np.zeros(3), 0.01 * np.eye(3), None, np.array([0.0, 0.0, 1.0]))
+        add_answers(one, made, 1.0)
+        return (one, made, 0.1), {}
+
+    benchmark.pedantic(add_answers, setup=bank, rounds=200)

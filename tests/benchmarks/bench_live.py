@@ -2,7 +2,7 @@
 
     pytest tests/benchmarks/bench_live.py -s
 
-Seven seconds of LiDAR (754 packets a second), servo and autopilot go through the field's stages; four stages in one
+Thirteen seconds of LiDAR (754 packets a second), servo and autopilot go through the field's stages; four stages in one
 thread (as configs/field.yaml has them) against a thread for each.
 """
 

@@ -118,17 +118,16 @@ def test_track_frame(benchmark, near):
     assert len(benchmark(frame)) == 2
 
 
-# A recorded street in slices of 10 ms of packets: one round is one slice, so the median is that of a slice. A slice has
-# 7.5 packets: 1 ms a slice is 133 us a packet. Limit of the design: 1 ms median for sweep, detect and track together.
-# A message is one packet, or four, as in the field.
+# A recorded street: one round is 10 ms of packets, so the median is that of 10 ms, which have 7.5 packets: 1 ms is 133 us
+# a packet. Limit of the design: 1 ms median for sweep, detect and track together. A message is a packet, or a slice.
 
 SLICE_NS = 10 * MS
 
 
-@pytest.fixture(scope="module", params=[1, 4], ids=["one packet a message", "four"])
+@pytest.fixture(scope="module", params=[0.1, 10.0], ids=["one packet a message", "slices"])
 def street(request):
     """Per 10 ms the packets and servo states of the recording as they came; and where the drone was at the start."""
-    servo, lidar, slices, drone = Servo(), Lidar(packets=request.param), defaultdict(list), None
+    servo, lidar, slices, drone = Servo(), Lidar(slice_ms=request.param), defaultdict(list), None
     with RecordingReader(RECORDING) as recording:
         rig = yaml.safe_load(recording.rig_yaml)
         start_ns = recording.start_ns + FROM_NS

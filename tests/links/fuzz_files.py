@@ -15,10 +15,10 @@ from flow.link import LinkError
 from links.cli.files import read_rig
 from links.cli.lens import read_lens
 from links.evaluation.text_files import read_tum
-from links.recording import import_file
+from links.importing import import_file
 from links.runs import as_live
-from tests.links.recording.captures import ethernet, pcap, udp
-from tests.links.recording.test_recording_import_tlog import frames, tlog
+from tests.links.importing.captures import ethernet, pcap, udp
+from tests.links.importing.test_import_tlog import frames, tlog
 from tests.links.runs.test_foreign_recordings import RIGS, configuration
 from tests.stages.geometry.test_lens_files import KALIBR, OCAMCALIB
 

@@ -149,7 +149,7 @@ def records(topics: list[str], most: int = 20) -> list[bytes]:
 
 
 def vlp16() -> InputFormat:
-    lidar, mutator, now = Lidar(), Mutator(records(["/lidar/packets"])), [10**18]
+    lidar, mutator, now = Lidar(slice_ms=0.1), Mutator(records(["/lidar/packets"])), [10**18]
 
     def take(data: bytes) -> object:
         now[0] += 1_327_104
@@ -265,7 +265,7 @@ def camera_frames() -> InputFormat:
 
 def zenoh_messages() -> InputFormat:
     kinds = {name: cls for name, cls in vars(messages).items() if isinstance(cls, type) and issubclass(cls, Message)}
-    lidar = Lidar().decode(Record("/lidar/packets", 10**18, 10**18, records(["/lidar/packets"], 2)[0]))
+    lidar = Lidar(slice_ms=0.1).decode(Record("/lidar/packets", 10**18, 10**18, records(["/lidar/packets"], 2)[0]))
     state = Servo().decode(Record("/servo/state", 1, 1, records(["/servo/state"], 2)[0]))
     tick, lost = messages.Tick(stamp_ns=1), messages.TrackState(
         stamp_ns=1, state=messages.TrackingState.LOST, reason="gone", hits=1, frame_s=0.1, track_id=2

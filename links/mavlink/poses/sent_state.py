@@ -22,7 +22,7 @@ from pathlib import Path
 
 from links.mavlink.transport.framing import dialect
 
-WRITE_PERIOD_NS = 1_000_000_000  # period of writing
+WRITE_PERIOD_NS = 100_000_000  # period of writing; after a source switch an older frame odom is another one
 
 
 class SentState:
@@ -52,7 +52,7 @@ class SentState:
             self._odom = odom()
 
     def write(self) -> None:
-        """Write the newest pose, at most once a second. Until it succeeds it is repeated."""
+        """Write the newest pose, at most once each WRITE_PERIOD_NS. Until it succeeds it is repeated."""
         newest = self._newest
         if self._file is None or newest is None or newest[0] == self._written_ns:
             return

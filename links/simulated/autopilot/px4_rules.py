@@ -39,6 +39,7 @@ class Px4Rules(Rules):
     ekf2_eva_noise: float = 0.1
     ekf2_ev_qmin: int = 0
     ekf2_ev_delay_ms: int = 0
+    compass: bool = False  # EKF2_MAG_TYPE other than 5: a position in LOCAL_NED needs no rotation
     gate: float = 5.0  # EKF2_EVP_GATE
     interval_ms: int = 200  # EV_MAX_INTERVAL
     failing_s: float = 1.0  # no_aid_timeout_max
@@ -73,7 +74,8 @@ class Px4Rules(Rules):
             return PoseResult.WRONG_FRAME
         xyz, R, velocity, upper = pose_of(message)
         position_var, angle_var = variances_of(upper)
-        if not (np.isfinite(xyz).all() and np.isfinite(R).all()):
+        by_compass = self.compass and message.frame_id == LOCAL_NED
+        if not (np.isfinite(xyz).all() and (by_compass or np.isfinite(R).all())):
             return PoseResult.NOT_FINITE
         pose = ExternalPose(
             now_ns - self.ekf2_ev_delay_ms * MS,

@@ -1,7 +1,8 @@
 """A sensor of the drone's position instead of LiDAR, servo, detection and track: fast flights in closed loop.
 
-Its fixes have the rate, delay and errors that LikelihoodTrack's fixes have in simulation (a 0.5 m drone, 11 m away: 10
-Hz, 11 ms, 0.03 m per axis with a correlation of 0.65 from fix to fix, half of it constant): errors grow with the range.
+Its fixes have the rate, delay and errors that LikelihoodTrack's fixes have in simulation (10 Hz, 11 ms; a 0.5 m drone,
+11 m away: 0.03 m per axis; varying errors with a correlation of 0.7 from fix to fix and 0.7 of the variance that the
+track reports): errors grow with the range.
 
     fix = true position + constant bias + first-order Gauss-Markov error
 
@@ -37,7 +38,8 @@ class FixSensorSettings(BaseModel):
     latency_s: float = Field(default=0.011, ge=0, le=0.5)
     sigma_per_m: float = Field(default=0.0025, ge=0)  # of the varying error, per axis and metre of range
     bias_per_m: float = Field(default=0.002, ge=0)  # one sigma of the constant error
-    correlation_s: float = Field(default=0.25, gt=0)
+    correlation_s: float = Field(default=0.3, gt=0)
+    variance_share: float = Field(default=0.7, gt=0, le=1)  # true variance of the varying error over the reported one
     velocity_mps: float = Field(default=0.1, ge=0)  # one sigma of the reported velocity
     detection: float = Field(default=0.97, gt=0, le=1)  # probability of each fix
     of_other_s: tuple[float, float] | None = None  # (from, to): the fixes are those of the first other drone
@@ -89,6 +91,6 @@ class FixSensor:
         return {
             "xyz_m": np.round(xyz, 5).tolist(),
             "velocity_mps": np.round(velocity, 4).tolist(),
-            "sigma_m": round(range_m * s.sigma_per_m, 6),
+            "sigma_m": round(range_m * s.sigma_per_m / math.sqrt(s.variance_share), 6),
             "bias_sigma_m": round(range_m * s.bias_per_m, 6),
         }

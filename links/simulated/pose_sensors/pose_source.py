@@ -74,12 +74,6 @@ class SimulatedRotations(Source[SimulatedRotationsSettings]):
     def decode(self, record: Record) -> RelativeRotation:
         """One rotation."""
         content = json.loads(record.data)
-        return RelativeRotation(
-            stamp_ns=record.stamp_ns,
-            R_vehicle_drone=nearest_rotation(np.array(content["R"])),
-            covariance_rad2=content["sigma_rad"] ** 2 * np.eye(3),
-            branch_probability=np.full(4, 0.25),
-            state=BranchState.AMBIGUOUS,
-            switches=0,
-            reason="simulated rotation",
-        )
+        R, covariance = nearest_rotation(np.array(content["R"])), content["sigma_rad"] ** 2 * np.eye(3)
+        open_branch, state = np.full(4, 0.25), BranchState.OPEN
+        return RelativeRotation.one(record.stamp_ns, R, covariance, open_branch, state, 0, "simulated rotation")

@@ -18,7 +18,8 @@ from stages.kernels.detect.isolation import INNER_HITS, INNER_PASSES, TALLY, cou
 FURTHEST_STEP_M = 2.5  # largest distance of an observation from the prediction
 MAX_COST = 9.0  # of an observation: squared sigmas
 RECENT_NS = 1_500_000_000  # pass-throughs are not counted for candidates observed longer ago
-FAN_COS = 0.93  # cosine of half the angle that a slice covers
+FAN_MARGIN_RAD = 0.02  # beyond a slice's directions
+CHUNK = 192  # pulses of a slice for which a candidate stands still: 0.6 ms of a VLP-16
 X, Y, Z, VX, VY, VZ, P_X, P_XV, P_V = range(9)  # [m], [m/s] in frame map, and their variances
 STAMP, SEEN = 0, 1  # [ns]
 NO_PULSE, NEAR, OUTSIDE = 0, 1, 2  # status of a candidate: no pulse near its middle; pulses near it; outside the fan
@@ -69,16 +70,27 @@ def nearest_row(
 
 
 @compiled
+def _in_vehicle(R: Array64, t: Array64, x: float, y: float, z: float, xyz_m: Array64) -> None:
+    """Fill xyz (3,) in frame vehicle with a position in frame map; R, t are T_map_vehicle."""
+    x, y, z = x - t[0], y - t[1], z - t[2]
+    for k in range(3):
+        xyz_m[k] = R[0, k] * x + R[1, k] * y + R[2, k] * z
+
+
+@compiled
 def count_pulses(
     state: Array64,
     ns: NDArray[np.int64],
     promising: NDArray[np.bool_],
     rows: int,
-    now_ns: int,
-    R: Array64,
-    t: Array64,
+    R_first: Array64,
+    t_first: Array64,
+    R_last: Array64,
+    t_last: Array64,
     axis: Array64,
+    half_rad: float,
     origin_m: Array64,
+    stamp_ns: NDArray[np.int64],
     direction: NDArray[np.float32],
     range_m: NDArray[np.float32],
     disc_m: float,
@@ -87,29 +99,34 @@ def count_pulses(
 ) -> int:
     """Fill found (rows, 3) with status, returns and pass-throughs of a slice's pulses at each candidate's middle.
 
-    Returns the number of rows that are not NO_PULSE. R, t are T_map_vehicle of the slice, axis (3,) its mean direction,
-    direction (k, 3) and range (k,) its pulses.
+    Returns the number of rows that are not NO_PULSE. R, t are T_map_vehicle at the slice's first and last pulse; axis
+    (3,) and half_rad are the cone around its directions; stamp (k,), direction (k, 3) and range (k,) its pulses.
     """
-    tally, away, centre = np.zeros(TALLY, dtype=np.int64), np.empty(3), np.empty(3)
-    count = 0
+    tally, first, last = np.zeros(TALLY, dtype=np.int64), np.empty(3), np.empty(3)
+    n, count = range_m.size, 0
+    start_ns, end_ns = stamp_ns[0], stamp_ns[n - 1]
+    fan_cos = math.cos(min(half_rad + FAN_MARGIN_RAD, math.pi))
     for row in range(rows):
         found[row] = 0
-        if not promising[row] or now_ns - ns[row, SEEN] > RECENT_NS:
+        if not promising[row] or end_ns - ns[row, SEEN] > RECENT_NS:
             continue
-        away[0], away[1], away[2], variance = predicted(state[row], (now_ns - ns[row, STAMP]) * 1e-9)
+        x, y, z, variance = predicted(state[row], (start_ns - ns[row, STAMP]) * 1e-9)
+        _in_vehicle(R_first, t_first, x, y, z, first)
+        x, y, z, variance = predicted(state[row], (end_ns - ns[row, STAMP]) * 1e-9)
+        _in_vehicle(R_last, t_last, x, y, z, last)
         if variance > most_variance:
             continue
-        away -= t
-        length2 = ahead = 0.0
-        for k in range(3):
-            along = R[0, k] * away[0] + R[1, k] * away[1] + R[2, k] * away[2] - origin_m[k]
-            centre[k] = along + origin_m[k]
-            length2 += along * along
-            ahead += along * axis[k]
-        length = math.sqrt(length2)
-        if length > 0.5 and ahead > length * FAN_COS:
+        away = 0.5 * (first + last) - origin_m
+        length = math.sqrt(away @ away)
+        if length > 0.5 and away @ axis > length * fan_cos:
             tally[INNER_HITS] = tally[INNER_PASSES] = 0
-            count_sectors(direction, range_m, origin_m, centre, disc_m, math.inf, math.inf, disc_m, 1.0, tally)
+            for k in range(0, n, CHUNK):
+                end = min(k + CHUNK, n)
+                share = (stamp_ns[(k + end) // 2] - start_ns) / max(end_ns - start_ns, 1)
+                centre = first + share * (last - first)
+                count_sectors(
+                    direction[k:end], range_m[k:end], origin_m, centre, disc_m, math.inf, math.inf, disc_m, 1.0, tally
+                )
             found[row, 1], found[row, 2] = tally[INNER_HITS], tally[INNER_PASSES]
             found[row, 0] = NEAR if tally[INNER_HITS] + tally[INNER_PASSES] > 0 else NO_PULSE
         else:

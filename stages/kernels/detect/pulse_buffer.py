@@ -14,7 +14,7 @@ from stages.geometry.frames import Array64
 from stages.kernels.compiled import compiled
 from stages.kernels.detect.isolation import TALLY, count_sectors
 
-WINDOW_NS = 8_600_000  # length of the buffer: 31 deg of a rotor at 600 rpm and the newest slice
+WINDOW_NS = 8_600_000  # before the newest slice: 31 deg of a rotor at 600 rpm
 ROUNDED_RAD = 1e-3  # bound of the rounding of directions
 
 
@@ -24,6 +24,8 @@ def keep_slice(
     range_m: NDArray[np.float32],
     origin_m: Array64,
     axis: Array64,
+    half_rad: float,
+    start_ns: int,
     end_ns: int,
     k: int,
     directions: NDArray[np.float32],
@@ -33,19 +35,13 @@ def keep_slice(
     sizes: NDArray[np.int64],
     ends_ns: NDArray[np.int64],
 ) -> None:
-    """Write a slice and its `fan` into row k of the buffer; slices before the window get size 0."""
-    widest = 1.0
-    for i in range(range_m.size):
-        along = 0.0
-        for j in range(3):
-            directions[k, i, j] = direction[i, j]
-            along += direction[i, j] * axis[j]
-        ranges_m[k, i] = range_m[i]
-        widest = min(widest, along)
-    origins_m[k], fans[k, :3], fans[k, 3] = origin_m, axis, math.acos(max(widest, -1.0))
+    """Write a slice and its cone (axis, half_rad) into row k of the buffer; slices before the window get size 0."""
+    directions[k, : range_m.size] = direction
+    ranges_m[k, : range_m.size] = range_m
+    origins_m[k], fans[k, :3], fans[k, 3] = origin_m, axis, half_rad
     sizes[k], ends_ns[k] = range_m.size, end_ns
     for row in range(sizes.size):
-        if end_ns - ends_ns[row] > WINDOW_NS:
+        if start_ns - ends_ns[row] > WINDOW_NS:
             sizes[row] = 0
 
 

@@ -7,8 +7,17 @@ from __future__ import annotations
 
 from stages.geometry.frames import Array64
 from stages.kernels.compiled import compiled
+from stages.kernels.geometry.so3 import exp_rotation
 
 STEP_NS = 50_000_000  # interval over which a velocity is computed
+
+
+@compiled
+def moved(
+    R: Array64, t: Array64, turn_radps: Array64, velocity_mps: Array64, seconds: float
+) -> tuple[Array64, Array64]:
+    """R, t after some seconds of a constant angular velocity (3,), in the child axes of R, and a constant velocity."""
+    return R @ exp_rotation(seconds * turn_radps), t + seconds * velocity_mps
 
 
 @compiled

@@ -2,7 +2,9 @@
 
 A packet is a row of blocks, each with an azimuth and one entry (range, reflectivity) per pulse. Where its fields are is
 described by three arrays, made by `links/lidar/packet_format.py`: LAYOUT, SCALES, and a row of PULSE_COLUMNS per pulse
-of a block. Source: see `links/lidar/decode.py`.
+of a block. Positions are unsigned: for signed ones numba also compiles counting from the end.
+
+Source: see `links/lidar/decode.py`.
 """
 
 from __future__ import annotations
@@ -62,33 +64,33 @@ _TAU_F32 = np.float32(math.tau)
 
 
 @compiled
-def _u16(data: bytes, at: int) -> int:
-    return data[at] | (data[at + 1] << 8)
+def _u16(data: Bytes, at: np.uint64) -> np.int64:
+    return np.int64(data[at]) | (np.int64(data[at + np.uint64(1)]) << 8)
 
 
 @compiled
-def _valid(data: bytes, at: int, status_at: int) -> bool:
-    return status_at < 0 or data[at + status_at] & 1 == 1
+def _valid(data: Bytes, at: np.uint64, status_at: int) -> bool:
+    return status_at < 0 or data[at + np.uint64(status_at)] & 1 == 1
 
 
 @compiled
-def _u64(data: bytes, at: int) -> int:
-    value = 0
+def _u64(data: Bytes, at: np.uint64) -> np.int64:
+    value = np.int64(0)
     for k in range(8):
-        value |= data[at + k] << (8 * k)
+        value |= np.int64(data[at + np.uint64(k)]) << (8 * k)
     return value
 
 
 @compiled
-def _rotation(data: bytes, dual: bool, layout: Integers) -> float:
+def _rotation(data: Bytes, dual: bool, layout: Integers) -> float:
     """Mean rotation per block time [counts]; NaN if the azimuths are invalid."""
     turn, blocks = layout[AZIMUTH_TURN], layout[BLOCKS]
     half, turned, before = turn // 2, 0, 0
     for block in range(blocks):
-        at = layout[FIRST_BLOCK_AT] + block * layout[BLOCK_BYTES]
+        at = np.uint64(layout[FIRST_BLOCK_AT] + block * layout[BLOCK_BYTES])
         if not _valid(data, at, layout[STATUS_IN_BLOCK]):
             continue
-        azimuth = _u16(data, at + layout[AZIMUTH_IN_BLOCK])
+        azimuth = _u16(data, at + np.uint64(layout[AZIMUTH_IN_BLOCK]))
         if azimuth >= turn:
             return np.nan
         if block > 0:
@@ -101,80 +103,11 @@ def _rotation(data: bytes, dual: bool, layout: Integers) -> float:
 
 
 @compiled
-def _decode_blocks(
-    data: bytes,
-    stamp_ns: int,
-    layout: Integers,
-    scales: Array64,
-    pulses: Array64,
-    rate: float,
-    first_block: int,
-    block_step: int,
-    range_in_entry: int,
-    kind: int,
-    rows: Rows,
-    row: int,
-) -> int:
-    """Fill a row for each entry of every `block_step`th block, from `row` on; returns the row after the last."""
-    count, block_ns, unit_m, origin_m = len(pulses), layout[BLOCK_NS], scales[RANGE_UNIT_M], scales[ORIGIN_M]
-    azimuth_unit_rad, time_at, wide, mask = (
-        math.tau / layout[AZIMUTH_TURN],
-        layout[TIME_IN_BLOCK],
-        layout[RANGE_BYTES] == 4,
-        layout[RANGE_MASK],
-    )
-    first_ns = -1
-    turn_rad = np.empty(count)
-    cos_turn = np.empty(count)
-    sin_turn = np.empty(count)
-    for j in range(count):
-        turn_rad[j] = rate * pulses[j, TURN_NS] / block_ns * azimuth_unit_rad + pulses[j, AZIMUTH_OFFSET_RAD]
-        cos_turn[j], sin_turn[j] = math.cos(turn_rad[j]), math.sin(turn_rad[j])
-
-    shade_at = layout[REFLECTIVITY_AFTER_RANGE]
-    for number, block in enumerate(range(first_block, layout[BLOCKS], block_step)):
-        block_at = layout[FIRST_BLOCK_AT] + block * layout[BLOCK_BYTES]
-        if not _valid(data, block_at, layout[STATUS_IN_BLOCK]):
-            continue
-        block_rad = _u16(data, block_at + layout[AZIMUTH_IN_BLOCK]) * azimuth_unit_rad + scales[AZIMUTH_ZERO_RAD]
-        cos_block, sin_block = math.cos(block_rad), math.sin(block_rad)
-        block_stamp_ns = stamp_ns + number * block_ns
-        if time_at >= 0:
-            time_ns = _u64(data, block_at + time_at)
-            if first_ns < 0:
-                first_ns = time_ns
-            block_stamp_ns = stamp_ns + (time_ns - first_ns)
-        entries_at = block_at + layout[FIRST_ENTRY_IN_BLOCK]
-        for j in range(count):
-            range_at = entries_at + j * layout[ENTRY_BYTES] + range_in_entry
-            counts = _u16(data, range_at)
-            if wide:
-                counts |= _u16(data, range_at + 2) << 16
-            r: float = (counts & mask) * unit_m
-            rows.range_m[row + j] = r
-            rows.reflectivity[row + j] = data[range_at + shade_at]
-            level = r - origin_m if r > 0.0 else 0.0
-            x = level * pulses[j, COS_ELEVATION] * (sin_block * cos_turn[j] + cos_block * sin_turn[j])
-            y = level * pulses[j, COS_ELEVATION] * (cos_block * cos_turn[j] - sin_block * sin_turn[j])
-            if origin_m > 0.0 and r > 0.0:  # the beams start beside the axis
-                x += origin_m * sin_block
-                y += origin_m * cos_block
-            rows.xyz_lidar_m[row + j, 0] = x
-            rows.xyz_lidar_m[row + j, 1] = y
-            rows.xyz_lidar_m[row + j, 2] = level * pulses[j, SIN_ELEVATION] + pulses[j, Z_OFFSET_M] if r > 0.0 else 0.0
-        for j in range(count):
-            angle_rad = block_rad + turn_rad[j]
-            if angle_rad < 0.0:
-                angle_rad += math.tau
-            elif angle_rad >= math.tau:
-                angle_rad -= math.tau
-            rounded = np.float32(angle_rad)
-            rows.azimuth_rad[row + j] = rounded if rounded < _TAU_F32 else np.float32(0.0)
-            rows.pulse_stamp_ns[row + j] = block_stamp_ns + np.int64(pulses[j, DELAY_NS])
-            rows.laser[row + j] = np.uint8(pulses[j, LASER])
-            rows.return_kind[row + j] = kind
-        row += count
-    return row
+def _range_m(data: Bytes, at: np.uint64, wide: bool, mask: int, unit_m: float) -> float:
+    counts = _u16(data, at)
+    if wide:
+        counts |= _u16(data, at + np.uint64(2)) << 16
+    return (counts & mask) * unit_m
 
 
 @compiled
@@ -199,45 +132,83 @@ def decode(
     Dual return: even blocks hold the last return and odd ones the strongest, or an entry holds both. A pulse gets a row
     for its strongest or only return, and a second one after it where its last return is another.
     """
-    rows = Rows(pulse_stamp_ns, laser, azimuth_rad, range_m, reflectivity, return_kind, xyz_lidar_m)
+    packet = np.frombuffer(data, np.uint8)
     second = layout[SECOND_RANGE_IN_ENTRY]
     in_pairs = dual and second < 0
-    rate = _rotation(data, in_pairs, layout)
+    rate = _rotation(packet, in_pairs, layout)
     if np.isnan(rate):
         return 0
-    if not dual:
-        end = _decode_blocks(data, stamp_ns, layout, scales, pulses, rate, 0, 1, 0, KIND_STRONGEST, rows, first_row)
-        return end - first_row
-    size = layout[BLOCKS] * len(pulses)
-    both = Rows(
-        np.empty(2 * size, np.int64),
-        np.empty(2 * size, np.uint8),
-        np.empty(2 * size, np.float32),
-        np.empty(2 * size, np.float32),
-        np.empty(2 * size, np.uint8),
-        np.empty(2 * size, np.uint8),
-        np.empty((2 * size, 3), np.float32),
-    )
-    count = 0
-    for kind in (KIND_STRONGEST, KIND_LAST):
-        first_block, step = (1 - kind, 2) if in_pairs else (0, 1)
-        range_at = second if kind == KIND_LAST and not in_pairs else 0
-        end = _decode_blocks(
-            data, stamp_ns, layout, scales, pulses, rate, first_block, step, range_at, kind, both, kind * size
+    count, block_ns, block_bytes = len(pulses), layout[BLOCK_NS], layout[BLOCK_BYTES]
+    unit_m, origin_m = scales[RANGE_UNIT_M], scales[ORIGIN_M]
+    azimuth_unit_rad, time_at = math.tau / layout[AZIMUTH_TURN], layout[TIME_IN_BLOCK]
+    wide, mask, entry_bytes = layout[RANGE_BYTES] == 4, layout[RANGE_MASK], np.uint64(layout[ENTRY_BYTES])
+    shade_at = np.uint64(layout[REFLECTIVITY_AFTER_RANGE])
+    to_last = -block_bytes if in_pairs else second
+    first_ns = -1
+    turn_rad, cos_turn, sin_turn = np.empty(count), np.empty(count), np.empty(count)
+    cos_elevation, sin_elevation, z_offset_m = np.empty(count), np.empty(count), np.empty(count)
+    delay_ns, lasers = np.empty(count, np.int64), np.empty(count, np.uint8)
+    for j in range(count):
+        turn_rad[j] = rate * pulses[j, TURN_NS] / block_ns * azimuth_unit_rad + pulses[j, AZIMUTH_OFFSET_RAD]
+        cos_turn[j], sin_turn[j] = math.cos(turn_rad[j]), math.sin(turn_rad[j])
+        cos_elevation[j], sin_elevation[j] = pulses[j, COS_ELEVATION], pulses[j, SIN_ELEVATION]
+        z_offset_m[j], delay_ns[j] = pulses[j, Z_OFFSET_M], np.int64(pulses[j, DELAY_NS])
+        lasers[j] = np.uint8(pulses[j, LASER])
+
+    row, step = np.uint64(first_row), 2 if in_pairs else 1
+    for number, block in enumerate(range(step - 1, layout[BLOCKS], step)):
+        block_at = np.uint64(layout[FIRST_BLOCK_AT] + block * block_bytes)
+        if not _valid(packet, block_at, layout[STATUS_IN_BLOCK]):
+            continue
+        block_rad = (
+            _u16(packet, block_at + np.uint64(layout[AZIMUTH_IN_BLOCK])) * azimuth_unit_rad + scales[AZIMUTH_ZERO_RAD]
         )
-        count = end - kind * size
-    row = first_row
-    for pulse in range(count):
-        strongest, last = both.range_m[pulse], both.range_m[size + pulse]
-        for kind in range(2 if 0 != last != strongest != 0 else 1):
-            source = pulse + size * (kind == KIND_LAST or (strongest == 0 and last != 0))
-            rows.pulse_stamp_ns[row] = both.pulse_stamp_ns[source]
-            rows.laser[row] = both.laser[source]
-            rows.azimuth_rad[row] = both.azimuth_rad[source]
-            rows.range_m[row] = both.range_m[source]
-            rows.reflectivity[row] = both.reflectivity[source]
-            rows.return_kind[row] = kind
-            for axis in range(3):
-                rows.xyz_lidar_m[row, axis] = both.xyz_lidar_m[source, axis]
-            row += 1
-    return row - first_row
+        cos_block, sin_block = math.cos(block_rad), math.sin(block_rad)
+        block_stamp_ns = stamp_ns + number * block_ns
+        if time_at >= 0:
+            time_ns = _u64(packet, block_at + np.uint64(time_at))
+            if first_ns < 0:
+                first_ns = time_ns
+            block_stamp_ns = stamp_ns + (time_ns - first_ns)
+        entries_at = block_at + np.uint64(layout[FIRST_ENTRY_IN_BLOCK])
+        for pulse in range(count):
+            j = np.uint64(pulse)
+            range_at = entries_at + j * entry_bytes
+            r = _range_m(packet, range_at, wide, mask, unit_m)
+            returns, last_m, last_at = 1, 0.0, range_at
+            if dual:
+                last_at = np.uint64(np.int64(range_at) + to_last)
+                last_m = _range_m(packet, last_at, wide, mask, unit_m)
+                if last_m != 0.0 and r == 0.0:
+                    r, range_at = last_m, last_at
+                elif last_m != 0.0 and last_m != r:
+                    returns = 2
+            angle_rad = block_rad + turn_rad[j]
+            if angle_rad < 0.0:
+                angle_rad += math.tau
+            elif angle_rad >= math.tau:
+                angle_rad -= math.tau
+            rounded = np.float32(angle_rad)
+            azimuth = rounded if rounded < _TAU_F32 else np.float32(0.0)
+            across = sin_block * cos_turn[j] + cos_block * sin_turn[j]
+            along = cos_block * cos_turn[j] - sin_block * sin_turn[j]
+            for kind in range(returns):
+                if kind == KIND_LAST:
+                    r, range_at = last_m, last_at
+                level = r - origin_m if r > 0.0 else 0.0
+                x = level * cos_elevation[j] * across
+                y = level * cos_elevation[j] * along
+                if origin_m > 0.0 and r > 0.0:  # the beams start beside the axis
+                    x += origin_m * sin_block
+                    y += origin_m * cos_block
+                xyz_lidar_m[row, np.uint64(0)] = x
+                xyz_lidar_m[row, np.uint64(1)] = y
+                xyz_lidar_m[row, np.uint64(2)] = level * sin_elevation[j] + z_offset_m[j] if r > 0.0 else 0.0
+                range_m[row] = r
+                reflectivity[row] = packet[range_at + shade_at]
+                azimuth_rad[row] = azimuth
+                pulse_stamp_ns[row] = block_stamp_ns + delay_ns[j]
+                laser[row] = lasers[j]
+                return_kind[row] = kind
+                row += np.uint64(1)
+    return np.int64(row) - first_row  # pyright: ignore[reportReturnType]

@@ -1,4 +1,4 @@
-"""Compiled functions that average the directions of pulses.
+"""Compiled function for the directions of pulses, and bounds of the runs of returns.
 
 Source: ours.
 """
@@ -19,19 +19,20 @@ LONGEST, STEP, HOLE = 1.6, 0.7, 0.6
 
 
 @compiled
-def mean_direction(direction: NDArray[np.float32]) -> Array64:
-    """The mean (3,) of directions (n, 3), n > 0, summed in single precision as numpy's mean does."""
-    x = y = z = np.float32(0.0)
+def cone_of(direction: NDArray[np.float32]) -> tuple[Array64, float]:
+    """The cone around directions (n, 3), n > 0: their mean as a unit vector (3,), and the largest angle to it [rad].
+
+    For a zero mean the axis is zero, and the cone includes all directions.
+    """
+    x = y = z = 0.0
     for i in range(direction.shape[0]):
         x += direction[i, 0]
         y += direction[i, 1]
         z += direction[i, 2]
-    n = np.float32(direction.shape[0])
-    return np.array([x / n, y / n, z / n], dtype=np.float64)
-
-
-@compiled
-def mean_unit_direction(direction: NDArray[np.float32]) -> Array64:
-    """`mean_direction` as a unit vector (3,); zero for a zero mean."""
-    mean = mean_direction(direction)
-    return mean / max(math.sqrt(mean[0] ** 2 + mean[1] ** 2 + mean[2] ** 2), 1e-9)
+    length = max(math.sqrt(x * x + y * y + z * z), 1e-9 * direction.shape[0])
+    x, y, z = x / length, y / length, z / length
+    widest = 1.0
+    for i in range(direction.shape[0]):
+        widest = min(widest, direction[i, 0] * x + direction[i, 1] * y + direction[i, 2] * z)
+    axis = np.array([x, y, z])
+    return axis, math.pi if x == y == z == 0.0 else math.acos(max(widest, -1.0))

@@ -6,12 +6,45 @@ Source: see `stages/sweep/turntable.py`.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stages.geometry.frames import Array64
 from stages.kernels.compiled import compiled
+
+
+class Firings(NamedTuple):
+    """A slice of the LiDAR: rows as in `LidarFirings`."""
+
+    stamp_ns: NDArray[np.int64]
+    laser: NDArray[np.uint8]
+    azimuth_rad: NDArray[np.float32]
+    range_m: NDArray[np.float32]
+    reflectivity: NDArray[np.uint8]
+    return_kind: NDArray[np.uint8]
+    xyz_lidar_m: NDArray[np.float32]
+
+
+class Returns(NamedTuple):
+    """Returns in the vehicle frame."""
+
+    stamp_ns: NDArray[np.int64]
+    xyz_m: NDArray[np.float32]  # (n, 3)
+    laser: NDArray[np.uint8]
+    reflectivity: NDArray[np.uint8]
+    turntable_rad: NDArray[np.float32]
+
+
+class Pulses(NamedTuple):
+    """Pulses in the vehicle frame."""
+
+    stamp_ns: NDArray[np.int64]
+    direction: NDArray[np.float32]  # (n, 3)
+    range_m: NDArray[np.float32]
+    laser: NDArray[np.uint8]
+    reflectivity: NDArray[np.uint8]
 
 
 @compiled
@@ -41,82 +74,56 @@ def turns_at(
 
 
 @compiled
-def place_returns(
-    range_m: NDArray[np.float32],
-    xyz_lidar_m: NDArray[np.float32],
+def origin_at(angle_rad: float, T_vehicle_turntable: Array64, T_turntable_lidar: Array64) -> tuple[float, float, float]:
+    """Origin of the beams [m], vehicle frame, for a turntable angle; NaN counts as 0."""
+    angle_rad = 0.0 if math.isnan(angle_rad) else angle_rad
+    A, B = T_vehicle_turntable, T_turntable_lidar
+    c, s = math.cos(angle_rad), math.sin(angle_rad)
+    x, y, z = c * B[0, 3] - s * B[1, 3], s * B[0, 3] + c * B[1, 3], B[2, 3]
+    return (
+        A[0, 0] * x + A[0, 1] * y + A[0, 2] * z + A[0, 3],
+        A[1, 0] * x + A[1, 1] * y + A[1, 2] * z + A[1, 3],
+        A[2, 0] * x + A[2, 1] * y + A[2, 2] * z + A[2, 3],
+    )
+
+
+@compiled
+def place_slice(
+    firings: Firings,
+    elevation_rad: Array64,
     turn: Array64,
     min_range_m: float,
     T_vehicle_turntable: Array64,
     T_turntable_lidar: Array64,
-    pulse: NDArray[np.int64],
-    xyz_vehicle_m: NDArray[np.float32],
-    turntable_rad: NDArray[np.float32],
-) -> tuple[int, int]:
-    """Fill the last three arrays with the returns of a packet, in order: pulse index, point, angle.
+    returns: Returns,
+    pulses: Pulses,
+) -> tuple[int, int, int, int, tuple[float, float, float]]:
+    """Fill `returns` and `pulses` with those of a slice in the vehicle frame, in order.
 
-    Returns (number filled, number without an angle). Pulses nearer than min_range_m or without return are skipped.
+    Returns the numbers of returns, of returns without an angle, of pulses, of fired pulses, and the beams' origin at
+    the middle pulse, which the pulses' directions and distances are relative to. A return is skipped nearer than
+    min_range_m. A pulse has the distance of its nearest return, 0: none, and then the direction (cos w sin a,
+    cos w cos a, sin w) of the lidar frame. There are no pulses where an angle is not known.
     """
     A, B = T_vehicle_turntable, T_turntable_lidar
-    placed = unplaced = 0
-    for i in range(range_m.size):
-        if range_m[i] <= 0.0 or range_m[i] < min_range_m:
-            continue
-        angle, c, s = turn[i, 0], turn[i, 1], turn[i, 2]
-        if math.isnan(angle):
-            unplaced += 1
-            continue
-        px, py, pz = xyz_lidar_m[i, 0], xyz_lidar_m[i, 1], xyz_lidar_m[i, 2]
-        x = B[0, 0] * px + B[0, 1] * py + B[0, 2] * pz + B[0, 3]
-        y = B[1, 0] * px + B[1, 1] * py + B[1, 2] * pz + B[1, 3]
-        z = B[2, 0] * px + B[2, 1] * py + B[2, 2] * pz + B[2, 3]
-        x, y = c * x - s * y, s * x + c * y
-        for axis in range(3):
-            xyz_vehicle_m[placed, axis] = A[axis, 0] * x + A[axis, 1] * y + A[axis, 2] * z + A[axis, 3]
-        pulse[placed] = i
-        turntable_rad[placed] = angle
-        placed += 1
-    return placed, unplaced
-
-
-@compiled
-def place_pulses(
-    return_kind: NDArray[np.uint8],
-    laser: NDArray[np.uint8],
-    azimuth_rad: NDArray[np.float32],
-    range_m: NDArray[np.float32],
-    xyz_lidar_m: NDArray[np.float32],
-    elevation_rad: Array64,
-    turn: Array64,
-    T_vehicle_turntable: Array64,
-    T_turntable_lidar: Array64,
-    origin_vehicle_m: Array64,
-    row: NDArray[np.int64],
-    direction_vehicle: NDArray[np.float32],
-    distance_m: NDArray[np.float32],
-) -> int:
-    """Fill the last three arrays with every pulse of a packet: its row, unit direction, distance of its nearest return.
-
-    Both are relative to origin_vehicle_m (3,). Returns the number of pulses, 0 if an angle is not known. A pulse
-    without a return has the direction (cos w sin a, cos w cos a, sin w) of the lidar frame.
-    """
-    A, B = T_vehicle_turntable, T_turntable_lidar
-    n = 0
+    n_returns = unplaced = n = fired = 0
+    known = True
     cos_w, sin_w = np.cos(elevation_rad), np.sin(elevation_rad)
-    for i in range(range_m.size):
-        if return_kind[i] != 0:  # the last return of the previous pulse
-            if n > 0 and range_m[i] > 0.0 and (distance_m[n - 1] == 0.0 or range_m[i] < distance_m[n - 1]):
-                n -= 1  # nearer: replaces it
-            else:
-                continue
+    origin = origin_at(turn[turn.shape[0] // 2, 0], A, B)
+    for i in range(firings.range_m.size):
+        r = firings.range_m[i]
+        seen = r > 0.0
+        fired += firings.return_kind[i] == 0
         angle, c, s = turn[i, 0], turn[i, 1], turn[i, 2]
         if math.isnan(angle):
-            return 0
-        seen = range_m[i] > 0.0
+            known = False
+            unplaced += seen and r >= min_range_m
+            continue
         if seen:
-            px, py, pz = float(xyz_lidar_m[i, 0]), float(xyz_lidar_m[i, 1]), float(xyz_lidar_m[i, 2])
+            px, py, pz = firings.xyz_lidar_m[i, 0], firings.xyz_lidar_m[i, 1], firings.xyz_lidar_m[i, 2]
         else:
-            level, up = cos_w[laser[i]], sin_w[laser[i]]
-            px, py, pz = level * math.sin(azimuth_rad[i]), level * math.cos(azimuth_rad[i]), up
+            level, up = cos_w[firings.laser[i]], sin_w[firings.laser[i]]
+            px, py, pz = level * math.sin(firings.azimuth_rad[i]), level * math.cos(firings.azimuth_rad[i]), up
         x = B[0, 0] * px + B[0, 1] * py + B[0, 2] * pz
         y = B[1, 0] * px + B[1, 1] * py + B[1, 2] * pz
         z = B[2, 0] * px + B[2, 1] * py + B[2, 2] * pz
@@ -126,15 +133,24 @@ def place_pulses(
         vx = A[0, 0] * x + A[0, 1] * y + A[0, 2] * z
         vy = A[1, 0] * x + A[1, 1] * y + A[1, 2] * z
         vz = A[2, 0] * x + A[2, 1] * y + A[2, 2] * z
+        if seen and r >= min_range_m:
+            returns.stamp_ns[n_returns] = firings.stamp_ns[i]
+            returns.laser[n_returns], returns.reflectivity[n_returns] = firings.laser[i], firings.reflectivity[i]
+            returns.turntable_rad[n_returns] = angle
+            returns.xyz_m[n_returns, 0] = vx + A[0, 3]
+            returns.xyz_m[n_returns, 1] = vy + A[1, 3]
+            returns.xyz_m[n_returns, 2] = vz + A[2, 3]
+            n_returns += 1
+        if firings.return_kind[i] != 0:  # the last return of the previous pulse
+            if not (n > 0 and seen and (pulses.range_m[n - 1] == 0.0 or r < pulses.range_m[n - 1])):
+                continue
+            n -= 1  # nearer: replaces it
         if seen:
-            vx += A[0, 3] - origin_vehicle_m[0]
-            vy += A[1, 3] - origin_vehicle_m[1]
-            vz += A[2, 3] - origin_vehicle_m[2]
+            vx, vy, vz = vx + (A[0, 3] - origin[0]), vy + (A[1, 3] - origin[1]), vz + (A[2, 3] - origin[2])
         length = math.sqrt(vx * vx + vy * vy + vz * vz)
-        row[n] = i
-        direction_vehicle[n, 0] = vx / length
-        direction_vehicle[n, 1] = vy / length
-        direction_vehicle[n, 2] = vz / length
-        distance_m[n] = length if seen else 0.0
+        pulses.stamp_ns[n] = firings.stamp_ns[i]
+        pulses.laser[n], pulses.reflectivity[n] = firings.laser[i], firings.reflectivity[i]
+        pulses.direction[n, 0], pulses.direction[n, 1], pulses.direction[n, 2] = vx / length, vy / length, vz / length
+        pulses.range_m[n] = length if seen else 0.0
         n += 1
-    return n
+    return n_returns, unplaced, n if known else 0, fired, origin

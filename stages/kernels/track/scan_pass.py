@@ -12,8 +12,6 @@ import numpy as np
 from stages.geometry.frames import Array64
 from stages.kernels.compiled import compiled
 
-SCAN_COS = math.cos(math.radians(24.0))  # a slice covers 15 deg to each side of its middle and 5 deg along the scan
-
 
 @compiled
 def largest_sigma_m(P: Array64) -> float:
@@ -29,14 +27,33 @@ def misfit(xyz_m: Array64, x: Array64, P: Array64) -> float:
 
 
 @compiled
-def line_of_sight(R: Array64, t: Array64, origin_m: Array64, x: Array64, axis: Array64) -> tuple[Array64, float, bool]:
-    """(vector to a state's position (3,) [m], its length, whether the slice covers it), in the vehicle frame.
+def line_of_sight(
+    R_first: Array64,
+    t_first: Array64,
+    R_last: Array64,
+    t_last: Array64,
+    origin_m: Array64,
+    x: Array64,
+    after_s: float,
+    span_s: float,
+    axis: Array64,
+    half_rad: float,
+    reach_m: float,
+) -> tuple[Array64, Array64, Array64, bool]:
+    """(vector (3,) [m] to a state's position, extrapolated to the state's time, its velocity (3,) [m/s] within a slice,
+    R_map_vehicle (3, 3) of the slice's middle, whether pulses may pass within reach_m of it), in the vehicle frame.
 
-    R, t are T_map_vehicle at the slice; origin (3,) and axis (3,) are the origin and mean direction of its beams.
+    R, t are T_map_vehicle at the slice's first pulse, after_s after the state x (6,), and at its last, span_s later;
+    origin (3,) is that of the beams; axis (3,) and half_rad are the cone around them.
     """
-    away = R.T @ (x[:3] - t) - origin_m
-    range_m = math.sqrt(away @ away)
-    return away, range_m, range_m >= 0.5 and bool(away @ axis >= range_m * math.sqrt(axis @ axis) * SCAN_COS)
+    first = R_first.T @ (x[:3] + after_s * x[3:] - t_first) - origin_m
+    last = R_last.T @ (x[:3] + (after_s + span_s) * x[3:] - t_last) - origin_m
+    velocity = (last - first) / span_s if span_s > 0.0 else np.zeros(3)
+    middle = 0.5 * (first + last)
+    range_m = math.sqrt(middle @ middle)
+    around_rad = half_rad + math.atan(reach_m / max(range_m, 0.5))
+    here = range_m >= 0.5 and bool(middle @ axis >= range_m * math.cos(min(around_rad, math.pi)))
+    return first - after_s * velocity, velocity, 0.5 * (R_first + R_last), here
 
 
 @compiled

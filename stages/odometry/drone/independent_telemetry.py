@@ -36,11 +36,11 @@ from stages.messages import (
     EarlierOdomFrame,
     HeadingPrior,
 )
-from stages.odometry.drone.trajectory import DRIFT_RAD2_PER_S
 
 RATE_NS = 100_000_000  # largest age of an IMU sample against the attitude
 PRIOR_S = 30.0  # since the newest pose of the earlier run
 POSITION_NS = 200_000_000  # largest age of the autopilot's position against the attitude; it is extrapolated
+DRIFT_RAD2_PER_S = math.radians(0.3) ** 2  # random walk of the autopilot's yaw
 START_M, DRIFT_MPS2 = 0.5, 0.11  # error of the autopilot's position when the earlier run ended (assumed); its growth
 
 

@@ -1,12 +1,13 @@
 """Motion of the drone over each interval between two IMU samples, with the noise of the samples.
 
 The one stage that reads the drone's motion from its autopilot: gaps, restarts and resets are resolved here, everybody
-else reads its DroneMotion. The mean over an interval is that of its two samples (trapezoid). A gap, and a clock that
-was set back, end a segment. Specific force, rate and the vertical are the drone's own measurements; the autopilot's
-position, velocity and yaw are added only while they cannot contain a pose that grd sent (`independent`).
+else reads its DroneMotion. The mean over an interval is that of its two samples (trapezoid). A single false sample is
+left out (imu_outliers.py). A gap, and a clock that was set back, end a segment. Specific force, rate and the vertical
+are the drone's own measurements; the autopilot's position, velocity and yaw are added only while they cannot contain a
+pose that grd sent (`independent`).
 
-With a sample noise s, the noise density of an interval of dt is s sqrt(dt): integrated over many intervals, each sample
-counts once with dt, so that the variance of the velocity grows by s^2 dt per second.
+The noise is a density, estimated from the samples (imu_noise.py): with a density d the variance of the velocity grows
+by d^2 per second. Until it is known, samples with white noise s at intervals of dt have the density s sqrt(dt).
 
 Source: ours; P V.B, V.E. Initial noise: ArduPilot EK3_ACC_P_NSE 0.35 m/s^2 and EK3_GYRO_P_NSE 0.015 rad/s; least noise:
 MPU-6000 product specification 3.4, 6.1 and 6.2 (400 ug/sqrt(Hz), 0.005 deg/s/sqrt(Hz)).
@@ -24,7 +25,8 @@ from pydantic import Field
 from flow.stage import Settings, Stage
 from stages.messages import DroneAttitude, DroneImu, DroneLocalPosition, DroneMotion, DroneOdometry, DroneTilt
 from stages.odometry.drone.autopilot_estimate import AutopilotEstimate
-from stages.odometry.drone.imu_noise import SampleNoise
+from stages.odometry.drone.imu_noise import NoiseDensity
+from stages.odometry.drone.imu_outliers import FalseSamples
 
 CLOCK_SET_NS = 1_000_000_000  # a stamp that is earlier by more: the clock was set; by less: late or repeated
 
@@ -33,7 +35,8 @@ class InertialMotionSettings(Settings):
     """Settings of `InertialMotion`."""
 
     longest_gap_s: float = Field(0.25, gt=0, le=1)  # between two samples of a segment; 10 Hz with one sample lost
-    noise_window_s: float = Field(0.22, gt=0, le=2)  # of the local fit
+    noise_window_s: float = Field(0.22, gt=0, le=2)  # of the local fit to samples; twice that to blocks
+    noise_block_s: float = Field(0.05, gt=0, le=1)  # samples are averaged over: frequencies above 10 Hz
     noise_average_s: float = Field(2.0, gt=0, le=60)
     initial_force_mps2: float = Field(0.35, gt=0)  # noise of a sample, until it is estimated
     initial_rate_radps: float = Field(0.015, gt=0)
@@ -50,7 +53,12 @@ class InertialMotion(Stage[InertialMotionSettings]):
     def __init__(self, settings: InertialMotionSettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
         self._autopilot = AutopilotEstimate(self.settings.autopilot_age_s)
-        self._noise = SampleNoise(self.settings.noise_window_s, self.settings.noise_average_s)
+        s = self.settings
+        self._noise = (
+            NoiseDensity(0.0, s.noise_window_s, s.noise_average_s),
+            NoiseDensity(s.noise_block_s, 2 * s.noise_window_s, s.noise_average_s),
+        )
+        self._false = FalseSamples()
         self._last: DroneImu | None = None
         self._segment = 0
         self._counts: Counter[str] = Counter()
@@ -88,6 +96,9 @@ class InertialMotion(Stage[InertialMotionSettings]):
         if not 0 < dt_ns <= 1e9 * self.settings.longest_gap_s:
             self._segment += 1
             return self._begin(imu)
+        if self._is_false(imu):
+            self._counts["false samples"] += 1
+            return None
         force = 0.5 * (last.acceleration_drone_mps2 + imu.acceleration_drone_mps2)
         rate = 0.5 * (last.angular_velocity_drone_radps + imu.angular_velocity_drone_radps)
         self._add(imu)
@@ -106,15 +117,24 @@ class InertialMotion(Stage[InertialMotionSettings]):
         )
 
     def _begin(self, imu: DroneImu) -> None:
-        self._noise.new_segment()
+        for noise in self._noise:
+            noise.new_segment()
+        self._false.new_segment()
+        self._is_false(imu)
         self._add(imu)
 
+    def _is_false(self, imu: DroneImu) -> bool:
+        return self._false.add(imu.stamp_ns, imu.acceleration_drone_mps2, imu.angular_velocity_drone_radps)
+
     def _add(self, imu: DroneImu) -> None:
-        self._noise.add(imu.stamp_ns, imu.acceleration_drone_mps2, imu.angular_velocity_drone_radps)
+        for noise in self._noise:
+            noise.add(imu.stamp_ns, imu.acceleration_drone_mps2, imu.angular_velocity_drone_radps)
         self._last = imu
 
     def _noise_densities(self, dt_s: float) -> tuple[float, float]:
-        """White-noise densities of specific force and rate over an interval."""
+        """Noise densities of specific force and rate over an interval."""
         s, root = self.settings, math.sqrt(dt_s)
-        force, rate = self._noise.sigma or (s.initial_force_mps2, s.initial_rate_radps)
-        return max(force * root, s.least_force_noise), max(rate * root, s.least_rate_noise)
+        known = [noise.density for noise in self._noise if noise.density is not None]
+        known = known or [(s.initial_force_mps2 * root, s.initial_rate_radps * root)]
+        force, rate = (max(part) for part in zip(*known, strict=True))
+        return max(force, s.least_force_noise), max(rate, s.least_rate_noise)

@@ -108,9 +108,10 @@ class VehicleMotionSelector(Stage[VehicleMotionSelectorSettings]):
             return None
         self._waiting.append(pulses)
         newest_ns = self._reported.newest_ns
-        while newest_ns is not None and self._waiting and self._waiting[0].middle_ns <= newest_ns:
+        while newest_ns is not None and self._waiting and self._waiting[0].point_stamp_ns[-1] <= newest_ns:
             oldest = self._waiting.popleft()
-            error = self._scan.add(oldest, *self._reported.at(oldest.middle_ns))
+            ends_ns = oldest.stamp_ns, int(oldest.point_stamp_ns[-1])
+            error = self._scan.add(oldest, self._reported.at(ends_ns[0]), self._reported.at(ends_ns[1]))
             if error is not None and self._consistency.add(error):
                 return self._deny(error.stamp_ns - WITHDRAWN_NS, frozen=False)
         return None

@@ -19,6 +19,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,11 +67,19 @@ class _Revolution:
     forward: Array64  # (3,) axis x of the vehicle
 
 
+class _Posed(NamedTuple):
+    """A slice and the reported T_map_vehicle, R (3, 3) and t (3,), at its first and last pulse."""
+
+    pulses: SweptPulses
+    first: tuple[Array64, Array64]
+    last: tuple[Array64, Array64]
+
+
 class StaticScan:
     """Compares each revolution with the one before."""
 
     def __init__(self) -> None:
-        self._slices: deque[tuple[SweptPulses, Array64, Array64]] = deque()  # with R_map_vehicle and t_map_vehicle
+        self._slices: deque[_Posed] = deque()
         self._turned_rad = 0.0  # of the rotor, by the slices
         self._before: _Revolution | None = None
 
@@ -79,18 +88,23 @@ class StaticScan:
         self._slices.clear()
         self._turned_rad, self._before = 0.0, None
 
-    def add(self, pulses: SweptPulses, R_map_vehicle: Array64, xyz_map_m: Array64) -> VelocityError | None:
-        """Add a slice with the reported pose of its time. The velocity error at a revolution's end, if observable."""
+    def add(
+        self, pulses: SweptPulses, first: tuple[Array64, Array64], last: tuple[Array64, Array64]
+    ) -> VelocityError | None:
+        """Add a slice with the reported poses, R and t, at its first and last pulse.
+
+        Returns the velocity error at a revolution's end, if observable.
+        """
         firings = len(pulses.range_m) // LASERS
         if firings < 2 or firings * LASERS != len(pulses.range_m) or not math.isfinite(pulses.turntable_rad):
             return None
-        if self._slices and pulses.stamp_ns - self._slices[-1][0].stamp_ns > KEPT_NS:
+        if self._slices and pulses.stamp_ns - self._slices[-1].pulses.stamp_ns > KEPT_NS:
             self.restart()
         directions = pulses.direction_vehicle.reshape(firings, LASERS, 3)
-        first, last = (directions[at].astype(np.float64).mean(axis=0) for at in (0, -1))
-        cosine = float(first @ last / (np.linalg.norm(first) * np.linalg.norm(last)))
+        begin, end = (directions[at].astype(np.float64).mean(axis=0) for at in (0, -1))
+        cosine = float(begin @ end / (np.linalg.norm(begin) * np.linalg.norm(end)))
         self._turned_rad += math.acos(min(max(cosine, -1.0), 1.0)) * firings / (firings - 1)
-        self._slices.append((pulses, R_map_vehicle, xyz_map_m))
+        self._slices.append(_Posed(pulses, first, last))
         if self._turned_rad < 2 * math.pi:
             return None
         revolution = _revolution(list(self._slices))
@@ -100,13 +114,21 @@ class StaticScan:
         return None if before is None else velocity_error(before, revolution)
 
 
-def _revolution(slices: list[tuple[SweptPulses, Array64, Array64]]) -> _Revolution:
-    turned = [(pulses.direction_vehicle.reshape(-1, LASERS, 3).astype(np.float64) @ R.T) for pulses, R, _ in slices]
-    origins = [R @ np.array(pulses.origin_vehicle_m) + t for pulses, R, t in slices]
-    directions = np.concatenate(turned)
-    range_m = np.concatenate([pulses.range_m for pulses, _, _ in slices]).reshape(-1, LASERS).astype(np.float64)
-    stamp_ns = np.concatenate([pulses.point_stamp_ns[::LASERS] for pulses, _, _ in slices])
-    origin_m = np.repeat(np.array(origins), [len(part) for part in turned], axis=0)
+def _in_map(posed: _Posed) -> tuple[Array64, Array64]:
+    """Directions (f, 16, 3) and origins (f, 3) of a slice's firings in frame map, by poses interpolated linearly."""
+    stamp_ns = posed.pulses.point_stamp_ns[::LASERS]
+    share = ((stamp_ns - stamp_ns[0]) / max(int(posed.pulses.point_stamp_ns[-1] - stamp_ns[0]), 1))[:, None]
+    (R_0, t_0), (R_1, t_1) = posed.first, posed.last
+    R = R_0 + share[..., None] * (R_1 - R_0)
+    directions = posed.pulses.direction_vehicle.reshape(-1, LASERS, 3).astype(np.float64) @ R.transpose(0, 2, 1)
+    return directions, R @ np.array(posed.pulses.origin_vehicle_m) + t_0 + share * (t_1 - t_0)
+
+
+def _revolution(slices: list[_Posed]) -> _Revolution:
+    turned, origins = zip(*map(_in_map, slices), strict=True)
+    directions, origin_m = np.concatenate(turned), np.concatenate(origins)
+    range_m = np.concatenate([posed.pulses.range_m for posed in slices]).reshape(-1, LASERS).astype(np.float64)
+    stamp_ns = np.concatenate([posed.pulses.point_stamp_ns[::LASERS] for posed in slices])
     order, axis = _by_elevation(directions)
     directions, range_m = np.ascontiguousarray(directions[:, order]), np.ascontiguousarray(range_m[:, order])
     middle = directions[:, LASERS // 2 - 1] + directions[:, LASERS // 2]
@@ -120,7 +142,7 @@ def _revolution(slices: list[tuple[SweptPulses, Array64, Array64]]) -> _Revoluti
         axis=axis,
         middle=middle,
         step_rad=float(np.median(np.arcsin(sines))),
-        forward=slices[-1][1][:, 0],
+        forward=slices[-1].last[0][:, 0],
     )
 
 

@@ -24,6 +24,7 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from flow.stage import Settings, Stage
@@ -65,8 +66,8 @@ class _Now:
     poses: deque[tuple[int, Array64, Array64]] = field(  # the last two: stamp, T_map_camera
         default_factory=lambda: deque[tuple[int, Array64, Array64]](maxlen=2)
     )
-    waiting: deque[tuple[int, Array64]] = field(  # LiDAR slices not yet placed, camera frame
-        default_factory=lambda: deque[tuple[int, Array64]](maxlen=WAITING_SLICES)
+    waiting: deque[tuple[NDArray[np.int64], Array64]] = field(  # LiDAR slices not yet placed: stamps, camera frame
+        default_factory=lambda: deque[tuple[NDArray[np.int64], Array64]](maxlen=WAITING_SLICES)
     )
     cloud: deque[Array64] = field(default_factory=lambda: deque[Array64]())  # placed, start frame
     lengths: int = 0  # number of lengths measured
@@ -120,8 +121,7 @@ class VisualLidarOdometry(Stage[VisualLidarOdometrySettings]):
         n = self.settings.every_nth_point
         xyz = points.xyz_vehicle_m[::n].astype(np.float64)
         if len(xyz):
-            stamp_ns = int(points.point_stamp_ns[len(points.point_stamp_ns) // 2])
-            self._now.waiting.append((stamp_ns, (xyz - self._mount[:3, 3]) @ self._mount[:3, :3]))
+            self._now.waiting.append((points.point_stamp_ns[::n], (xyz - self._mount[:3, 3]) @ self._mount[:3, :3]))
 
     def on_image(self, image: Image) -> Iterator[VehicleMotion | FollowedFeatures]:
         """The vehicle's pose at this image, and the tracked features.
@@ -229,17 +229,21 @@ class VisualLidarOdometry(Stage[VisualLidarOdometrySettings]):
         return Pose6(R, p1 + ahead, now.key.at.covariance + np.diag([turn] * 3 + [place] * 3))
 
     def _place(self, stamp_ns: int, at: Pose6) -> None:
-        """Place the LiDAR points up to this image by interpolated poses, and add them to the keyframe."""
+        """Place the LiDAR slices up to this image by interpolated poses, and add them to the keyframe.
+
+        The position is interpolated for each point, the rotation for the slice.
+        """
         now, R, p = self._now, at.R, at.p
         t0, R0, p0 = now.poses[-1] if now.poses else (stamp_ns, R, p)
         now.poses.append((stamp_ns, R, p))
         turn = log_rotation(np.ascontiguousarray(R0.T @ R))
         placed: list[Array64] = []
-        while now.waiting and now.waiting[0][0] <= stamp_ns:
+        while now.waiting and now.waiting[0][0][-1] <= stamp_ns:
             at_ns, xyz = now.waiting.popleft()
-            if at_ns >= t0:
+            if at_ns[0] >= t0:
                 share = (at_ns - t0) / max(stamp_ns - t0, 1)
-                placed.append(xyz @ (R0 @ exp_rotation(share * turn)).T + p0 + share * (p - p0))
+                R_map_camera = R0 @ exp_rotation(float(share.mean()) * turn)
+                placed.append(xyz @ R_map_camera.T + p0 + share[:, None] * (p - p0))
         if not placed:
             return
         cloud = np.vstack(placed)

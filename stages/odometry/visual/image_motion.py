@@ -30,7 +30,11 @@ LONGEST_STEP_S = 1.0  # between two images; after a longer gap no rotation is pr
 
 
 class LinkSettings(BaseModel):
-    """Thresholds for a new key image, noise of a track, limit of hypotheses."""
+    """Thresholds for a new key image, noise of a track, errors that tracks share, limit of hypotheses.
+
+    `correlation` and `parallax_share` are measured: tests/stages/odometry/test_panorama_rotation.py and test_kitti.py.
+    `lens_share` is a calibration error of 0.3 px at 300 px from the centre.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -38,7 +42,11 @@ class LinkSettings(BaseModel):
     key_share: float = Field(default=0.4, gt=0, lt=1)  # minimum share of its tracks that are left
     key_age_s: float = Field(default=5.0, gt=0, le=60)
     least_noise_px: float = Field(default=0.05, gt=0, le=2)  # minimum, of one track, at the image centre
-    shared_noise_px: float = Field(default=0.08, ge=0, le=2)  # common to all tracks: lens, JPEG, perspective
+    shared_noise_px: float = Field(default=0.01, ge=0, le=2)  # common to all tracks, whatever the motion
+    correlation: float = Field(default=1.65, ge=1, le=10)  # of neighbouring tracks: measured over independent sigma
+    lens_share: float = Field(default=0.001, ge=0, le=0.1)  # error of the lens, as a share of the rotation
+    parallax_share: float = Field(default=0.025, ge=0, le=0.5)  # error of the rotation, as a share of the parallax
+    direction_sigma_deg: float = Field(default=0.5, ge=0, le=10)  # error of the direction that all tracks share
     tries: int = Field(default=60, ge=1, le=2000)  # maximum five-point hypotheses
 
 
@@ -64,7 +72,14 @@ class MotionLinks:
         self._tracker = FeatureTracker(lens, features)
         self._settings = settings
         pixel = pixel_rad(lens)
-        self._noise = Noise(settings.least_noise_px * pixel, settings.shared_noise_px * pixel)
+        self._noise = Noise(
+            settings.least_noise_px * pixel,
+            settings.shared_noise_px * pixel,
+            settings.correlation,
+            settings.lens_share,
+            settings.parallax_share,
+            math.radians(settings.direction_sigma_deg),
+        )
         self._key: Tracks | None = None
         self._before_ns = 0
         self._R_now_key: Array64 = np.eye(3)

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.geometry.frames import Array64
-from stages.kernels.geometry.so3 import hat
+from stages.kernels.geometry.so3 import hat, log_rotation
 from stages.kernels.visual.epipolar import (
     BEYOND_SIGMAS,
     CAUCHY,
@@ -66,6 +66,19 @@ class Noise:
 
     least_rad: float  # minimum, independent per track
     shared_rad: float  # common to all tracks: it does not average out
+    correlation: float = 1.0  # measured over independent sigma of a motion: errors of neighbouring tracks are alike
+    lens_share: float = 0.0  # common error of the lens, as a share of the rotation
+    parallax_share: float = 0.0  # common error of the rotation by parallax, as a share: moving things, warped templates
+    direction_rad: float = 0.0  # common error of the direction of translation
+
+    def rotation_variance_rad2(self, angle_rad: float, parallax_rad: float) -> float:
+        """Variance per axis of the common error of a rotation by an angle, with a parallax."""
+        return self.shared_rad**2 + (self.lens_share * angle_rad) ** 2 + (self.parallax_share * parallax_rad) ** 2
+
+    def direction_variance_rad2(self, angle_rad: float, parallax_rad: float) -> float:
+        """Variance per axis of the common error of the direction of translation."""
+        common = self.rotation_variance_rad2(angle_rad, 0.0)
+        return common / parallax_rad**2 + self.direction_rad**2
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,9 +150,10 @@ def relative_motion(
     parallax = float(np.median(separation[clearly])) if clearly.any() else 1e-9
     B = np.zeros((6, 5))
     B[:3, :3], B[3:, 3:] = np.eye(3), across(t)
-    covariance = B @ np.linalg.inv(information) @ B.T * sigma**2
-    covariance[:3, :3] += noise.shared_rad**2 * np.eye(3)
-    covariance[3:, 3:] += (noise.shared_rad / parallax) ** 2 * (np.eye(3) - np.outer(t, t))
+    covariance = B @ np.linalg.inv(information) @ B.T * (noise.correlation * sigma) ** 2
+    angle = float(np.linalg.norm(log_rotation(rotation)))
+    covariance[:3, :3] += noise.rotation_variance_rad2(angle, parallax) * np.eye(3)
+    covariance[3:, 3:] += noise.direction_variance_rad2(angle, parallax) * (np.eye(3) - np.outer(t, t))
     moved = TwoView(rotation, t, covariance, inlier, sigma, int(np.count_nonzero(clearly)), parallax)
     if turn is None:
         return moved
@@ -175,7 +189,9 @@ def _pure_rotation(earlier: Array64, later: Array64, R_guess: Array64, noise: No
     y = earlier[inlier] @ rotation.T
     H = (len(y) * np.eye(3) - y.T @ y) / 2.0  # both rays are noisy
     covariance = np.zeros((6, 6))
-    covariance[:3, :3] = np.linalg.inv(H) * sigma**2 + noise.shared_rad**2 * np.eye(3)
+    angle = float(np.linalg.norm(log_rotation(rotation)))
+    covariance[:3, :3] = np.linalg.inv(H) * (noise.correlation * sigma) ** 2
+    covariance[:3, :3] += noise.rotation_variance_rad2(angle, 0.0) * np.eye(3)
     return TwoView(rotation, None, covariance, inlier, sigma, 0, 0.0)
 
 

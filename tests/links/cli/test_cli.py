@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import re
 import shutil
 import subprocess
 import sys
@@ -13,6 +15,8 @@ import yaml
 
 from flow import subprocess_replay
 from flow.subprocess_replay import can_use_subprocesses
+from links.cli.app import COMMANDS
+from links.cli.app import command as command_named
 from links.cli.files import read_rig
 from tests.links import command
 
@@ -32,24 +36,7 @@ def without_viewer(folder: Path) -> Path:
     return overlay
 
 
-@pytest.mark.parametrize(
-    "command",
-    [
-        "run",
-        "replay",
-        "check",
-        "graph",
-        "schema",
-        "import",
-        "recover",
-        "preflight",
-        "calibrate",
-        "simulate",
-        "matrix",
-        "evaluate",
-        "view",
-    ],
-)
+@pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_has_a_help_text_with_an_example(grd, command):
     assert f"Example: grd {command} " in grd(command, "--help").replace("\n  ", " ").replace("  ", " ")
 
@@ -67,17 +54,29 @@ def test_a_wrong_argument_is_explained(grd, arguments, message):
     assert message in grd(*arguments, code=2)
 
 
-def test_quickstart_prints_the_position_of_the_drone_and_the_result_files(grd, tmp_path):
-    text = grd("run", ROOT / "configs" / "quickstart.yaml")
-    folder = tmp_path / "out" / "street_sweep-quickstart"
-    for words in ("x forward [m]", "output hash", "run.rrd", "fix_vehicle_drone.tum", "errors against the truth"):
+def test_a_run_prints_the_pose_of_the_drone_its_errors_and_the_result_files(grd, tmp_path):
+    text = grd("replay", STREET, "--config", ROOT / "configs" / "estimate.yaml")
+    folder = tmp_path / "out" / "street_sweep-estimate"
+    for words in (
+        "vehicle frame",
+        "yaw [deg]",
+        "error [deg]",
+        "output hash",
+        "fix_vehicle_drone.tum",
+        "never FULL, at",
+    ):
         assert words in text
+    for what in ("LiDAR positions", "fused poses"):
+        assert re.search(rf"^{what}, errors against the truth: RMSE x/y/z( 0\.\d+){{3}} m, 3D 0\.\d+ m", text, re.M)
     names = {path.name for path in folder.iterdir()}
     assert names == {
+        "candidates.csv",
         "config.yaml",
         "detections.csv",
         "fix_covariance.csv",
         "fix_vehicle_drone.tum",
+        "pose_covariance.csv",
+        "pose_vehicle_drone.tum",
         "run.log",
         "run.rrd",
         "summary.json",
@@ -87,9 +86,49 @@ def test_quickstart_prints_the_position_of_the_drone_and_the_result_files(grd, t
     }
     summary = json.loads((folder / "summary.json").read_text())
     assert summary["output_hash"] in text
+    assert 0 < max(summary["pose_errors"]["rmse_xyz_m"]) < summary["pose_errors"]["max_m"] < 1
     fixes = [line.split() for line in (folder / "fix_vehicle_drone.tum").read_text().splitlines()[1:]]
     assert len(fixes) == summary["fixes"] > 0
     assert all(len(line) == 8 for line in fixes)
+
+
+def test_a_run_without_a_fuse_stage_prints_the_positions_of_the_drone(grd, tmp_path):
+    text = grd("replay", STREET, "--overlay", without_viewer(tmp_path))
+    assert "x forward [m]" in text
+    assert "LiDAR positions, errors against the truth" in text
+    assert "fused" not in text
+
+
+def test_a_second_configuration_is_run_on_the_same_recording_and_printed_beside_the_first(grd, tmp_path):
+    (tmp_path / "one.yaml").write_text(
+        f"include: {ROOT}/configs/replay.yaml\nreplay: {STREET}\nlinks: {{viewer: null}}\n"
+    )
+    text = grd("run", "one.yaml", "--against", ROOT / "configs" / "paper.yaml", "--out", "a")
+    assert (tmp_path / "a" / "summary.json").is_file()
+    assert (tmp_path / "a-paper" / "summary.json").is_file()
+    table = text[text.index("side by side") :]
+    assert re.search(r"one .* paper", table)
+    assert re.search(r"recording .* street_sweep .* street_sweep", table)
+    near = re.search(r"within 1 m of the drone │\s+(\d+) │\s+(\d+) ", table)
+    assert near is not None
+    assert int(near[1]) > 10
+    assert int(near[2]) == 0
+    assert re.search(r"FULL\) after \[s\]\s+│\s+never │\s+never ", table)
+
+
+def test_a_live_configuration_has_nothing_to_be_run_against(grd):
+    assert "--against is for" in grd("run", "sim_live.yaml", "--against", "paper.yaml", code=2)
+
+
+@pytest.mark.slow
+def test_the_quickstart_reaches_the_whole_pose_beside_the_paper_which_does_not(grd, tmp_path):
+    text = grd("run", "quickstart", "--against", "quickstart_paper")
+    summary = json.loads((tmp_path / "out" / "experiment_1-quickstart" / "summary.json").read_text())
+    assert summary["recorded_s"] >= 30
+    assert summary["poses"]["states"]["FULL"] > 1000
+    assert max(summary["pose_errors"]["rmse_xyz_m"]) < 0.1
+    assert summary["pose_errors"]["rmse_deg"] < 0.5
+    assert re.search(r"FULL\) after \[s\]\s+│\s+\d\.\d │\s+never ", text)
 
 
 def test_two_replays_have_one_hash_and_one_never_overwrites_the_other(grd, tmp_path):
@@ -101,6 +140,17 @@ def test_two_replays_have_one_hash_and_one_never_overwrites_the_other(grd, tmp_p
     assert len(hashes) == 1
     again = grd("replay", STREET, "--out", tmp_path / "out" / names[0], code=2)
     assert "has a run already" in again
+
+
+def test_a_replay_without_the_hash_leaves_the_same_fixes(grd, tmp_path):
+    overlay = without_viewer(tmp_path)
+    grd("replay", STREET, "--overlay", overlay, "--out", "a")
+    text = grd("replay", STREET, "--overlay", overlay, "--out", "b", "--no-hash")
+    assert "output hash" not in text
+    assert json.loads((tmp_path / "b" / "summary.json").read_text())["output_hash"] is None
+    fixes = [(tmp_path / name / "fix_vehicle_drone.tum").read_text() for name in "ab"]
+    assert fixes[0] == fixes[1]
+    assert "--no-hash" in grd("replay", STREET, "--no-hash", "--expect", "0" * 16, code=2)
 
 
 @pytest.mark.skipif(not can_use_subprocesses(), reason="one core, or no fork: there is one process anyway")
@@ -203,6 +253,38 @@ def test_an_import_takes_the_rig_of_a_file_or_of_a_configuration(grd, tmp_path):
     assert rig["lidar"]["mount"]["T_turntable_lidar"]["rpy_deg"] == [90.0, 0.0, 0.0]
 
 
+def test_view_opens_the_newest_run_or_the_one_in_a_folder(grd, tmp_path, monkeypatch):
+    shown = []
+    monkeypatch.setattr("links.viewer.show", lambda file: shown.append(str(file)))
+    assert "out/ holds no run" in grd("view", code=2)
+    for age_s, name in enumerate(("new", "old")):
+        (tmp_path / "out" / name).mkdir(parents=True)
+        (tmp_path / "out" / name / "run.rrd").write_text("")
+        os.utime(tmp_path / "out" / name / "run.rrd", (1000 - age_s, 1000 - age_s))
+    assert "the newest run: out/new/run.rrd" in grd("view")
+    grd("view", "out/old")
+    grd("view", "out/old/run.rrd")
+    assert shown == ["out/new/run.rrd", "out/old/run.rrd", "out/old/run.rrd"]
+    (tmp_path / "empty").mkdir()
+    assert "empty holds no run.rrd" in grd("view", "empty", code=2)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_list_of_commands_has_the_beginning_of_the_help_of_each(grd, name):
+    _, text = COMMANDS[name]
+    assert " ".join((command_named(name).help or "").split()).startswith(text.rstrip("."))
+    assert text in " ".join(grd("--help").split())
+
+
+@pytest.mark.parametrize("option", ["--version", "--help"])
+def test_version_and_help_import_no_stage_and_no_viewer(option):
+    code = f"import sys; sys.argv = ['grd', {option!r}]; from links.cli import main; main()"
+    done = subprocess.run([sys.executable, "-X", "importtime", "-c", code], capture_output=True, text=True, check=True)
+    imported = {line.split("|")[-1].strip() for line in done.stderr.splitlines() if line.startswith("import time:")}
+    assert "typer" in imported
+    assert not {"numba", "rerun", "scipy", "cv2", "gtsam", "pymavlink", "flow.graph"} & imported
+
+
 def test_graph_and_schema_are_written(grd, tmp_path):
     grd("graph", ROOT / "configs" / "paper.yaml", "--format", "svg", "-o", "graph.svg")
     assert (tmp_path / "graph.svg").read_text().startswith("<svg ")
@@ -210,13 +292,17 @@ def test_graph_and_schema_are_written(grd, tmp_path):
     assert json.loads(grd("schema"))["title"] == "grd configuration"
 
 
-def test_the_quickstart_runs_without_the_packages_of_any_extra(tmp_path):
+def test_the_pipeline_of_the_quickstart_runs_without_the_packages_of_any_extra(tmp_path):
     """The README's first command installs none of them."""
     packages = ("embreex", "evo", "matplotlib", "pandas", "zenoh", "hypothesis", "velodyne_decoder", "mkdocs", "pytest")
-    code = (
-        f"import sys; sys.modules.update(dict.fromkeys({packages})); from links.cli import main; "
-        f"sys.argv = ['grd', 'run', 'configs/quickstart.yaml', '--out', {str(tmp_path / 'out')!r}]; main()"
-    )
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+    for arguments in (
+        ("check", "configs/quickstart.yaml"),
+        ("replay", str(STREET), "--config", "configs/estimate.yaml", "--out", str(tmp_path / "out")),
+    ):
+        code = (
+            f"import sys; sys.modules.update(dict.fromkeys({packages})); from links.cli import main; "
+            f"sys.argv = {['grd', *arguments]!r}; main()"
+        )
+        done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
     assert "output hash" in done.stdout

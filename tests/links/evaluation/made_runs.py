@@ -142,7 +142,15 @@ def yaw_quaternion(yaw_rad) -> np.ndarray:
 
 
 def add_rotations(
-    folder: Path, t_s, quaternions, *, variance_rad2=(1e-4, 1e-4, 1e-4), accepted=True, resolved=False, switches=0
+    folder: Path,
+    t_s,
+    quaternions,
+    *,
+    variance_rad2=(1e-4, 1e-4, 1e-4),
+    accepted=True,
+    resolved=False,
+    switches=0,
+    undecided="AMBIGUOUS",
 ) -> Path:
     """Add the rotation by both cameras at `t_s`, with a covariance along the drone's axes."""
     n = len(t_s)
@@ -151,7 +159,7 @@ def add_rotations(
     for i, t in enumerate(t_s):
         xx, yy, zz = variance_rad2
         numbers = [*(f"{v:.12g}" for v in quaternions[i]), *map(str, (xx, 0, 0, yy, 0, zz))]
-        state = ("RESOLVED" if resolved[i] else "AMBIGUOUS") if accepted[i] else "NONE"
+        state = ("RESOLVED" if resolved[i] else undecided) if accepted[i] else "NONE"
         cells = [stamp(t), str(int(accepted[i])), *(numbers if accepted[i] else [""] * 10), state, str(switches[i])]
         rows.append(",".join([*cells, '"lines, few"']))
     (folder / "rotation_vehicle_drone.csv").write_text("\n".join(rows) + "\n")

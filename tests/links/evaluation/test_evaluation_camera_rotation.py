@@ -55,15 +55,11 @@ def numbers(e: Evaluation, *keys: str) -> list[float | None]:
 
 
 def rotation(stamp_ns: int, R: np.ndarray | None, state: BranchState, switches: int = 0) -> RelativeRotation:
-    return RelativeRotation(
-        stamp_ns=stamp_ns,
-        R_vehicle_drone=R,
-        covariance_rad2=None if R is None else np.array([[1.0, 0.1, 0.2], [0.1, 2.0, 0.3], [0.2, 0.3, 3.0]]) * 1e-4,
-        branch_probability=np.array([0.7, 0.1, 0.15, 0.05]),
-        state=state,
-        switches=switches,
-        reason="9 lines, of both",
-    )
+    if R is None:
+        return RelativeRotation.none(stamp_ns, "9 lines, of both")
+    covariance = np.array([[1.0, 0.1, 0.2], [0.1, 2.0, 0.3], [0.2, 0.3, 3.0]]) * 1e-4
+    branches = np.array([0.7, 0.1, 0.15, 0.05])
+    return RelativeRotation.one(stamp_ns, R, covariance, branches, state, switches, "9 lines, of both")
 
 
 def test_every_rotation_is_a_line_of_the_run_and_is_read_back(tmp_path):
@@ -144,6 +140,16 @@ def test_a_wrong_branch_is_an_error_of_the_published_branch_and_none_modulo_90_d
     assert numbers(e, "switches", "wrong_resolved", "resolved") == [4, 0, 0]
     assert e.values["rotation_resolved_s"].note == "never RESOLVED"
     assert e.values["rotation_resolved_s"].failed
+
+
+def test_a_stage_that_leaves_the_branch_open_has_errors_modulo_90_degrees_alone(tmp_path):
+    folder = add_true_rotations(fly(tmp_path / "a"), LEVEL, LEVEL)
+    e = evaluated(add_rotations(folder, EIGHT_HZ, yaw_quaternion(np.full(80, math.radians(92.0))), undecided="OPEN"))
+    assert numbers(e, "modulo_90_rmse_deg") == pytest.approx([2.0])
+    for key in ("published_rmse_deg", "published_p95_deg", "resolved_s", "resolved_m", "wrong_resolved"):
+        value = e.values[f"rotation_{key}"]
+        assert value.value is None
+        assert not value.failed
 
 
 def test_yaw_branches_are_about_the_vertical_of_the_world(tmp_path):

@@ -6,6 +6,7 @@ import builtins
 import importlib.util
 import json
 import re
+import shutil
 import subprocess
 import sys
 from html.parser import HTMLParser
@@ -187,6 +188,32 @@ def test_the_report_needs_no_other_file_and_escapes_all_names(tmp_path):
     assert text.count("<svg") == text.count("</svg>") == 6
     assert max(row.count("<th>") for row in text.split("<tr>")) <= 16  # no wider than a screen
     assert (tmp_path / "evaluation.json").exists()
+
+
+BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+PROBE = """<script>addEventListener('load', () => {document.title = document.documentElement.scrollWidth + ' ' +
+getComputedStyle(document.body).backgroundColor + ' ' + document.querySelectorAll('svg').length})</script></body>"""
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine")
+@pytest.mark.parametrize(("scheme", "background"), [(0, "rgb(20, 23, 28)"), (1, "rgb(246, 247, 249)")])
+def test_a_browser_1280_px_wide_shows_the_report_without_scrolling_sideways_dark_and_light(
+    tmp_path, scheme, background
+):
+    """With a long name, in a comparison of several runs: the widest tables."""
+    runs = [fly(tmp_path / f"{'long_name_' * 12}{i}", 0.1, f"flight_{i}") for i in range(6)]
+    page = tmp_path / "report.html"
+    grd("evaluate", *runs, "--report", page)
+    page.write_text(page.read_text().replace("</body>", PROBE))
+    assert BROWSER is not None
+    options = ["--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'profile'}"]
+    options += [f"--blink-settings=preferredColorScheme={scheme}", "--window-size=1280,900", "--dump-dom"]
+    done = subprocess.run([BROWSER, *options, page.as_uri()], capture_output=True, text=True, check=False, timeout=300)
+    title = re.search(r"<title>(\d+) (rgb\(.*?\)) (\d+)</title>", done.stdout)
+    assert title is not None, done.stderr[-500:]
+    assert int(title[1]) <= 1280
+    assert title[2] == background
+    assert int(title[3]) >= 6
 
 
 def test_a_report_without_values_has_the_reasons(tmp_path):

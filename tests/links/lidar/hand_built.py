@@ -15,6 +15,7 @@ from flow.link import Record
 STRONGEST, LAST, DUAL = 0x37, 0x38, 0x39
 VLP16, HDL32E, PUCK_HI_RES = 0x22, 0x21, 0x24
 SINGLE_PACKET_NS = 1_327_104
+ONE_PACKET_MS = 0.1  # a slice that holds one packet of any model
 HOUR_NS = 3_600_000_000_000
 
 CHANNEL = np.dtype([("range", "<u2"), ("reflectivity", "u1")])

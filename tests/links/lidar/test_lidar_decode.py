@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import velodyne_decoder
-from hand_built import DUAL, LAST, PACKET, STRONGEST, captured_records, packet, record
+from hand_built import DUAL, LAST, ONE_PACKET_MS, PACKET, STRONGEST, captured_records, packet, record
 
 from flow.message import check_arrays
 from links.lidar import Lidar
@@ -15,7 +15,7 @@ REAL = ["vlp16_strongest_einride", "vlp16_strongest_gps_mrpt"]
 
 
 def decode(data, stamp_ns=0):
-    firings = Lidar().decode(record(data, stamp_ns))
+    firings = Lidar(slice_ms=ONE_PACKET_MS).decode(record(data, stamp_ns))
     assert firings is not None
     check_arrays(firings)
     return firings

@@ -15,18 +15,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 import velodyne_decoder
-from hand_built import captured, packet, record
+from hand_built import ONE_PACKET_MS, captured, packet, record
 from scipy.spatial import cKDTree
 
 from flow.counters import Counters
 from flow.graph import load_graph
 from flow.link import LinkError, Record
+from links.importing.pcap import PcapReport, read_datagrams
 from links.lidar import Lidar, hesai_beams, ouster_beams, recognised_model
 from links.lidar.checks import LidarObservation, lidar_checks
 from links.lidar.reject_reason import PacketRejectReason
 from links.preflight.check_result import Level
 from links.preflight.observations import ObservedSource
-from links.recording.pcap import PcapReport, read_datagrams
 from links.simulated.rig.scenario import RigLidar as ScenarioLidar
 from links.simulated.sensors.lidar_packets import PacketEncoder
 from stages.aim.beams import Rotor
@@ -68,7 +68,7 @@ def test_every_point_of_a_hesai_scan_is_that_of_an_independent_decoder(name, poi
     records = hesai_records(name)
     factory = "".join(f"{k + 1},{w},{a}\n" for k, (w, a) in enumerate(zip(*XT32_FACTORY, strict=True)))
     beams = hesai_beams("Channel,Elevation,Azimuth\n" + factory, "factory.csv") if name == "xt32" else None
-    lidar = Lidar(unit=RigLidar(model=name.upper(), beams=beams))
+    lidar = Lidar(slice_ms=ONE_PACKET_MS, unit=RigLidar(model=name.upper(), beams=beams))
     ours = points_of(lidar, records)
     cloud = next(OTHER.glob(f"hesai_{name}_*.pcd")).read_bytes()
     theirs = np.frombuffer(cloud[cloud.index(b"DATA binary\n") + 12 :], "<f4").reshape(-1, 3)
@@ -81,7 +81,7 @@ def test_a_hesai_tells_its_model_and_the_wrong_profile_is_refused():
     first = next(hesai_records("xt16"))
     assert recognised_model(first.data) == "XT16"
     for wrong in ("XT32", "VLP-16"):
-        lidar = Lidar(unit=RigLidar(model=wrong))
+        lidar = Lidar(slice_ms=ONE_PACKET_MS, unit=RigLidar(model=wrong))
         if wrong == "XT32":
             with pytest.raises(LinkError, match=r"come from a Hesai with 16 lasers.*the rig's LiDAR is a XT32"):
                 lidar.decode(first)
@@ -100,7 +100,7 @@ def test_a_velodyne_points_where_velodyne_decoder_does(model):
     else:
         ranges = np.random.default_rng(3).integers(500, 20_000, (12, 32))
         data = packet(ranges, azimuth=4_321, product=product)
-    firings = Lidar(unit=RigLidar(model=model)).decode(record(data))
+    firings = Lidar(slice_ms=ONE_PACKET_MS, unit=RigLidar(model=model)).decode(record(data))
     assert firings is not None
     oracle = velodyne_decoder.ScanDecoder(velodyne_decoder.Config(min_range=0.0, max_range=300.0))
     theirs = oracle.decode(velodyne_decoder.PacketVector([velodyne_decoder.VelodynePacket(0.0, data)]))
@@ -139,7 +139,7 @@ def ouster_firings(name: str, **change) -> Iterator[LidarFirings]:
     if not capture.exists():
         pytest.skip(f"{capture.name} is missing (../shared/data/lidar_other)")
     model, beams = ouster_beams((OTHER / f"{name}.json").read_text(), name)
-    lidar = Lidar(unit=RigLidar(model=model, beams=beams.model_copy(update=change)))
+    lidar = Lidar(slice_ms=ONE_PACKET_MS, unit=RigLidar(model=model, beams=beams.model_copy(update=change)))
     with capture.open("rb") as stream:
         for datagram in read_datagrams(stream, capture, PcapReport()):
             firings = lidar.decode(record(datagram.payload, datagram.time_ns))
@@ -184,7 +184,9 @@ def test_the_decoder_reads_what_the_simulated_sensor_sends(model, mode):
     shade = rng.integers(1, 256, shape).astype(np.uint8)
     turn = math.tau / 1024
     azimuth = math.pi / 2 + turn * np.arange(encoder.sequences)
-    firings = Lidar(unit=unit).decode(record(encoder.encode(START_NS, azimuth, range_m, shade), START_NS))
+    firings = Lidar(slice_ms=ONE_PACKET_MS, unit=unit).decode(
+        record(encoder.encode(START_NS, azimuth, range_m, shade), START_NS)
+    )
     assert firings is not None
     first = firings.return_kind == 0
     np.testing.assert_allclose(firings.range_m[first], range_m[0].ravel(), atol=1e-5)
@@ -219,7 +221,7 @@ def simulated_records(unit: RigLidar, packets: int) -> list[Record]:
 
 @pytest.mark.parametrize("model", ["VLP-32C", "HDL-32E", "XT16", "XT32", "OS0-128", "OS1-64"])
 def test_preflight_expects_the_packet_rate_of_the_model(model):
-    lidar = Lidar(unit=ScenarioLidar.model_validate({"model": model}))
+    lidar = Lidar(slice_ms=ONE_PACKET_MS, unit=ScenarioLidar.model_validate({"model": model}))
     observation = LidarObservation("/lidar/packets", lidar.form)
     records = simulated_records(lidar.settings.unit, 300)
     for each in records:
@@ -236,7 +238,7 @@ def test_preflight_expects_the_packet_rate_of_the_model(model):
 @pytest.mark.parametrize("model", ["XT32", "OS1-128"])
 def test_packets_of_the_model_arrive_live_over_udp(model):
     port = free_port()
-    lidar = Lidar(unit=ScenarioLidar.model_validate({"model": model}), port=port)
+    lidar = Lidar(slice_ms=ONE_PACKET_MS, unit=ScenarioLidar.model_validate({"model": model}), port=port)
     sent = simulated_records(lidar.settings.unit, 3)
     with lidar.listen() as records, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
         for each in sent:
@@ -250,7 +252,7 @@ def test_packets_of_the_model_arrive_live_over_udp(model):
 @pytest.mark.parametrize("model", LIDAR_MODELS)
 def test_the_rotors_rate_is_right_although_lasers_point_aside(model):
     unit = ScenarioLidar.model_validate({"model": model})
-    lidar, rotor = Lidar(unit=unit), Rotor(unit.azimuth_offset_rad, unit.azimuth_delay_ns)
+    lidar, rotor = Lidar(slice_ms=ONE_PACKET_MS, unit=unit), Rotor(unit.azimuth_offset_rad, unit.azimuth_delay_ns)
     for each in simulated_records(unit, 20):
         firings = lidar.decode(each)
         assert firings is not None

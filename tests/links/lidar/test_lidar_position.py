@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 
 import pytest
 import velodyne_decoder
-from hand_built import captured, packet, record
+from hand_built import ONE_PACKET_MS, captured, packet, record
 
 from flow.link import LinkError
 from links.lidar import Lidar
@@ -66,7 +66,7 @@ def test_all_real_position_packets_are_read_as_velodyne_decoder_reads_them():
 
 
 def test_the_data_topic_ignores_and_counts_position_packets():
-    lidar = Lidar()
+    lidar = Lidar(slice_ms=ONE_PACKET_MS)
     messages = [lidar.decode(record(data, stamp_ns)) for stamp_ns, data in captured("vlp16_strongest_gps_mrpt")]
     assert sum(message is not None for message in messages) == lidar.counters["decoded"] == 293
     assert sum(count for name, count in lidar.counters.items() if "position packet" in name) == 57

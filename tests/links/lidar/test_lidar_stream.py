@@ -8,6 +8,7 @@ from hand_built import (
     DUAL,
     HDL32E,
     HOUR_NS,
+    ONE_PACKET_MS,
     PUCK_HI_RES,
     SINGLE_PACKET_NS,
     STRONGEST,
@@ -31,12 +32,12 @@ SWEEP = """\
 stages:
   sweep: {use: stages.sweep.Sweep, config: {mount: {turns: false}}, inputs: {firings: lidar.lidar_firings}}
 links:
-  lidar: {use: links.lidar.Lidar}
+  lidar: {use: links.lidar.Lidar, config: {slice_ms: 0.1}}
 """
 
 
 def lost_in(records):
-    lidar = Lidar()
+    lidar = Lidar(slice_ms=ONE_PACKET_MS)
     lost = [lidar.decode(r).lost_packets for r in records]
     assert lidar.counters["lost"] == sum(lost)
     return lost
@@ -78,7 +79,7 @@ def test_a_real_stream_loses_nothing_until_packets_are_removed(capture):
 
 
 def test_repeated_and_overtaken_packets_are_ignored_and_counted():
-    lidar = Lidar()
+    lidar = Lidar(slice_ms=ONE_PACKET_MS)
     a, b, c, d = exact_records(4)
     messages = [lidar.decode(r) for r in (a, c, b, c, d)]
     assert [message is not None for message in messages] == [True, True, False, False, True]
@@ -86,8 +87,8 @@ def test_repeated_and_overtaken_packets_are_ignored_and_counted():
     assert rejected(lidar, PacketRejectReason.ORDER) == 2
 
 
-def decoded(records, packets):
-    lidar = Lidar(packets=packets)
+def decoded(records, packets, packet_ns=SINGLE_PACKET_NS):
+    lidar = Lidar(slice_ms=packets * packet_ns * 1e-6)
     return [lidar.decode(r) for r in records]
 
 
@@ -100,7 +101,7 @@ def test_several_packets_in_a_message_equal_the_single_packets_concatenated(mode
     interval_ns = SINGLE_PACKET_NS // (2 if mode == DUAL else 1)
     ranges = np.random.default_rng(1).integers(0, 30_000, (12, 32))
     records = exact_records(9, interval_ns=interval_ns, mode=mode, ranges=ranges)
-    single, three = decoded(records, 1), decoded(records, 3)
+    single, three = (decoded(records, n, interval_ns) for n in (1, 3))
     assert [message is not None for message in three] == 3 * [False, False, True]
     for k, group in enumerate(three[2::3]):
         check_arrays(group)
@@ -109,6 +110,12 @@ def test_several_packets_in_a_message_equal_the_single_packets_concatenated(mode
             if "n" in shape.dims:
                 parts = [getattr(one, name) for one in single[3 * k : 3 * k + 3]]
                 np.testing.assert_array_equal(getattr(group, name), np.concatenate(parts), err_msg=name)
+
+
+@pytest.mark.parametrize(("slice_ms", "packets"), [(0.1, 1), (1.9, 1), (2.1, 2), (10.0, 8)])
+def test_a_message_holds_the_packets_whose_duration_is_nearest_to_a_slice(slice_ms, packets):
+    lidar = Lidar(slice_ms=slice_ms)
+    assert packets_of(lidar.decode(r) for r in exact_records(packets)) == [0] * (packets - 1) + [packets]
 
 
 def test_a_gap_ends_a_message_and_the_next_one_holds_the_number_of_lost_packets():
@@ -148,7 +155,7 @@ def damaged(**change):
     ],
 )
 def test_a_bad_packet_in_a_good_stream_is_ignored_and_counted_as_lost(data, reason):
-    lidar = Lidar()
+    lidar = Lidar(slice_ms=ONE_PACKET_MS)
     first, _, third = exact_records(3)
     assert lidar.decode(first) is not None
     assert lidar.decode(record(data, SINGLE_PACKET_NS)) is None
@@ -160,7 +167,7 @@ def test_a_bad_packet_in_a_good_stream_is_ignored_and_counted_as_lost(data, reas
 def test_dual_return_blocks_of_one_pulse_share_their_azimuth():
     data = bytearray(packet(mode=DUAL))
     data[102] += 1
-    lidar = Lidar()
+    lidar = Lidar(slice_ms=ONE_PACKET_MS)
     assert lidar.decode(record(bytes(data))) is None
     assert rejected(lidar, PacketRejectReason.AZIMUTH) == 1
 
@@ -170,7 +177,7 @@ def test_dual_return_blocks_of_one_pulse_share_their_azimuth():
 )
 def test_another_model_is_rejected_by_name_at_its_first_packet(product, name):
     with pytest.raises(LinkError, match=rf"Velodyne {name}.*the rig's LiDAR is a VLP-16"):
-        Lidar().decode(record(packet(product=product)))
+        Lidar(slice_ms=ONE_PACKET_MS).decode(record(packet(product=product)))
 
 
 def test_an_hdl64_is_recognised_by_its_lower_blocks():
@@ -178,16 +185,16 @@ def test_an_hdl64_is_recognised_by_its_lower_blocks():
     for block in range(1, 12, 2):
         data[100 * block + 1] = 0xDD
     with pytest.raises(LinkError, match="HDL-64E"):
-        Lidar().decode(record(bytes(data)))
+        Lidar(slice_ms=ONE_PACKET_MS).decode(record(bytes(data)))
 
 
 def test_a_real_hdl32_capture_is_rejected_by_name():
     with pytest.raises(LinkError, match=r"HDL-32E \(product id 0x21\)"):
-        Lidar().decode(record(captured("hdl32_mrpt_WRONG_MODEL")[0][1]))
+        Lidar(slice_ms=ONE_PACKET_MS).decode(record(captured("hdl32_mrpt_WRONG_MODEL")[0][1]))
 
 
 def test_a_hundred_consecutive_bad_packets_are_an_error_with_the_reasons():
-    lidar = Lidar()
+    lidar = Lidar(slice_ms=ONE_PACKET_MS)
     lidar.decode(exact_records(1)[0])
     for _ in range(60):
         assert lidar.decode(record(bytes(1206))) is None
@@ -210,7 +217,7 @@ def test_a_recording_with_a_burst_of_bad_packets_is_replayed_to_its_end(tmp_path
 
 
 def test_one_good_packet_resets_the_count_of_bad_ones():
-    lidar = Lidar()
+    lidar = Lidar(slice_ms=ONE_PACKET_MS)
     good = exact_records(2)
     for r in (good[0], good[1]):
         for _ in range(99):
@@ -240,7 +247,7 @@ anything = st.one_of(
 @given(st.lists(st.tuples(anything, st.integers(-(2**62), 2**62)), max_size=6), st.sampled_from(["free", "utc"]))
 @settings(max_examples=300, deadline=None)
 def test_no_bytes_make_decode_raise_or_return_non_finite_values(packets, clock):
-    lidar = Lidar(clock=clock)
+    lidar = Lidar(clock=clock, slice_ms=ONE_PACKET_MS)
     for data, stamp_ns in packets:
         try:
             firings = lidar.decode(record(data, stamp_ns))
@@ -259,7 +266,7 @@ def test_the_same_stream_gives_the_same_messages_twice():
     random.Random(5).shuffle(shuffled)
 
     def stamps():
-        lidar = Lidar()
+        lidar = Lidar(slice_ms=ONE_PACKET_MS)
         return [firings and (firings.stamp_ns, firings.lost_packets) for firings in map(lidar.decode, shuffled)]
 
     assert stamps() == stamps()

@@ -4,7 +4,7 @@ import threading
 import time
 
 import pytest
-from hand_built import DUAL, SINGLE_PACKET_NS, packet
+from hand_built import DUAL, ONE_PACKET_MS, SINGLE_PACKET_NS, packet
 from pydantic import ValidationError
 
 from flow.link import LinkError
@@ -21,7 +21,7 @@ def port():
 
 
 def test_packets_arrive_in_order_as_records_that_decode(port):
-    lidar = Lidar(port=port)
+    lidar = Lidar(port=port, slice_ms=ONE_PACKET_MS)
     sent = [packet(azimuth=100 * k, time_us=1_327 * k) for k in range(5)]
     with lidar.listen() as records:
         before_ns = host_time.now_ns()
@@ -86,7 +86,7 @@ def test_an_address_of_another_machine_is_an_error_that_names_it(port):
 
 
 def test_leaving_the_context_ends_a_waiting_listener_and_frees_the_port(port):
-    lidar = Lidar(port=port)
+    lidar = Lidar(port=port, slice_ms=ONE_PACKET_MS)
     received, ended = [], threading.Event()
 
     def read(records):

@@ -16,8 +16,9 @@ from pymavlink.dialects.v20 import ardupilotmega
 from flow.link import Record
 from flow.message import check_arrays
 from flow.stage import output_ports
+from links.importing import import_file
 from links.mavlink import Autopilot
-from links.recording import RecordingReader, import_file
+from links.recording import RecordingReader
 from stages.messages import (
     AutopilotEstimator,
     AutopilotStatus,

@@ -88,14 +88,10 @@ def one_line(
 
 
 def rotation(stamp_ns: int = 0, **changes) -> RelativeRotation:
-    settled = RelativeRotation(
-        stamp_ns=stamp_ns,
-        R_vehicle_drone=rotation_z(np.deg2rad(30.0)),
-        covariance_rad2=np.diag(np.deg2rad([0.1, 0.2, 0.4]) ** 2),
-        branch_probability=np.array([0.6, 0.2, 0.1, 0.05]),
-        state=BranchState.AMBIGUOUS,
-        switches=0,
-        reason="waits for motion",
+    covariance = np.diag(np.deg2rad([0.1, 0.2, 0.4]) ** 2)
+    branches, state = np.array([0.6, 0.2, 0.1, 0.05]), BranchState.AMBIGUOUS
+    settled = RelativeRotation.one(
+        stamp_ns, rotation_z(np.deg2rad(30.0)), covariance, branches, state, 0, "waits for motion"
     )
     return dataclasses.replace(settled, **changes)
 
@@ -129,6 +125,6 @@ def run(duration_s: float) -> Iterator[tuple[str, Message]]:
         if k:
             still = {"direction_from": None, "direction_sigma_rad": None, "reason": "no motion"}
             yield "drone_odometry.visual_motion", motion(due_ns, **(still if k % 3 == 0 else {}))
-        none = {"R_vehicle_drone": None, "covariance_rad2": None, "state": BranchState.NONE, "reason": "no structure"}
-        yield "align.relative_rotation", rotation(due_ns, **(none if blind else {"switches": k // 6}))
+        none = RelativeRotation.none(due_ns, "no structure")
+        yield "align.relative_rotation", none if blind else rotation(due_ns, switches=k // 6)
         due_ns, k = due_ns + PERIOD_NS, k + 1

@@ -14,7 +14,7 @@ from links.viewer.draw import draw
 from links.viewer.draw_pose import rpy_deg
 from links.viewer.layout import Vision, layout
 from stages.geometry.frames import rotation_from_rpy_deg
-from stages.messages import BranchState, DroneFix
+from stages.messages import BranchState, DroneFix, RelativeRotation
 
 NAME = "align/relative_rotation"
 
@@ -73,8 +73,7 @@ def test_the_drones_axes_are_at_its_fix_and_dim_while_the_branch_is_ambiguous():
 def test_without_rotation_old_entities_are_cleared_and_the_reason_is_shown():
     where = at_a_fix()
     drawn(rotation(), NAME, where)
-    none = rotation(R_vehicle_drone=None, covariance_rad2=None, state=BranchState.NONE, reason="no structure here")
-    entities = drawn(none, NAME, where)
+    entities = drawn(RelativeRotation.none(0, "no structure here"), NAME, where)
     assert isinstance(entities[f"vehicle/{NAME}"].archetypes[0], rr.Clear)
     assert f"plots/rotation/{NAME}" not in entities
     np.testing.assert_allclose(numbers(entities["frames/sphere_drone"].archetypes[0].mat3x3).reshape(3, 3), np.eye(3))

@@ -9,15 +9,17 @@ import numpy as np
 import pytest
 
 from stages.align.spectra import (
+    LEAST_NONE,
     QUARTER,
     LevelLines,
+    Peak,
     level_axes,
     level_lines,
+    match_probabilities,
     nearby,
     overlap,
     peaks,
     quarter_difference,
-    shared_directions,
     spectrum,
 )
 from stages.kernels.align.spectra import BIN_RAD, BINS
@@ -112,15 +114,16 @@ def test_without_lines_the_overlap_is_zero():
     none = np.zeros(BINS)
     np.testing.assert_array_equal(overlap(none, spectrum_at(3.0)), np.zeros(QUARTER))
     assert peaks(overlap(none, none), 0.1) == []
-    assert shared_directions(none, none, 0.0) == 0
 
 
-def test_shared_directions_are_counted_modulo_90_deg():
-    vehicle = spectrum_at([0.0, 90.0, 0.0, 34.0, 34.0])
-    drone = spectrum_at([0.0, 34.0, 34.0, 124.0, 70.0, 70.0])
-    assert shared_directions(vehicle, drone, 0.0) == 2
-    assert shared_directions(vehicle, drone, math.radians(20.0)) == 1  # 70 on 90
-    assert shared_directions(vehicle, drone, math.radians(10.0)) == 0
+def test_a_better_match_is_more_probable_and_none_is_never_excluded():
+    one, other = Peak(0.1, 0.9), Peak(0.7, 0.6)
+    alone, both = match_probabilities([one]), match_probabilities([one, other])
+    assert 0.9 < alone[0] <= 1.0 - LEAST_NONE
+    assert both[0] > 5 * both[1]
+    assert both.sum() < 1.0 - 0.5 * LEAST_NONE
+    assert match_probabilities([]).shape == (0,)
+    np.testing.assert_allclose(match_probabilities([other, other]), match_probabilities([other, other])[::-1])
 
 
 def test_nearby_is_a_sum_over_neighbours_across_the_seam():

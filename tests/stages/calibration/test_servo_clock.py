@@ -26,6 +26,7 @@ from tests.stages.made import servo
 
 RECORDING = Path(__file__).resolve().parents[3] / "recordings" / "street_sweep.mcap"
 VIBRATING_S = 2.65  # a sweep one way, then vibration
+WINDOW_S = 2.3
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +43,7 @@ def recorded():
 def outputs_of(recorded, late_s=0.0, from_s=VIBRATING_S, to_s=9.0, motion=(), **settings):
     """Outputs of the stage when the servo's stamps are late by `late_s`."""
     mount, messages = recorded
-    stage = ServoClock(mount=settings.pop("mount", mount), window_s=2.4, **settings)
+    stage = ServoClock(mount=settings.pop("mount", mount), window_s=WINDOW_S, **settings)
     for message in motion:
         stage.on_motion(message)
     outputs, start_ns = [], messages[0].stamp_ns
@@ -150,7 +151,7 @@ def test_a_known_offset_skips_windows_and_ignores_their_data(recorded):
     stage_s = [(offset.stamp_ns - each[0].stamp_ns) * 1e-9 for offset in outputs_of(twice, to_s=20.0, every_window=3)]
     assert len(each) > 2
     assert len(stage_s) == 2
-    assert stage_s[1] > 3 * 2.4 - 0.1
+    assert stage_s[1] > 3 * WINDOW_S - 0.1
     moved = outputs_of(twice, to_s=20.0, every_window=3, motion=[driven(0.0), driven(0.1)])
     assert moved[0].reason == "the vehicle moved"
     assert moved[1].stamp_ns - moved[0].stamp_ns < 3e9  # the offset is unknown: no window is skipped

@@ -10,6 +10,7 @@ import pytest
 from stages.detect.candidate_table import ROWS, CandidateTable
 from stages.detect.observations import Slice
 from stages.kernels.detect.candidate_table import first_within
+from stages.kernels.sweep.pulses import cone_of
 from stages.messages import SweptPulses
 from tests.stages.detect.test_candidate import PLACE_M, candidate, observation, path
 from tests.stages.made import START_NS
@@ -30,12 +31,12 @@ def table(*positions_m, promising=True):
     return made
 
 
-def slice_towards(*positions_m, range_m):
+def slice_towards(*positions_m, range_m, stamp_ns=NOW_NS):
     directions = np.array(positions_m) / np.linalg.norm(positions_m, axis=1)[:, None]
     n = len(directions)
     pulses = SweptPulses(
-        stamp_ns=NOW_NS,
-        point_stamp_ns=np.full(n, NOW_NS, dtype=np.int64),
+        stamp_ns=stamp_ns,
+        point_stamp_ns=np.full(n, stamp_ns, dtype=np.int64),
         direction_vehicle=directions.astype(np.float32),
         range_m=np.full(n, range_m, dtype=np.float32),
         laser=np.zeros(n, dtype=np.uint8),
@@ -43,8 +44,8 @@ def slice_towards(*positions_m, range_m):
         turntable_rad=0.0,
         origin_vehicle_m=(0.0, 0.0, 0.0),
     )
-    mean = directions.mean(axis=0)
-    return Slice(pulses, np.eye(3), np.zeros(3), mean / np.linalg.norm(mean))
+    pose = np.eye(3), np.zeros(3)
+    return Slice(pulses, *cone_of(pulses.direction_vehicle), pose, pose)
 
 
 def test_an_observation_fits_the_nearest_candidate_in_sigmas():
@@ -83,22 +84,23 @@ def test_the_table_grows_and_removes_candidates():
 @pytest.mark.parametrize(("range_m", "returns", "pass_throughs"), [(0.0, 0, 2), (math.sqrt(378.0), 2, 0)])
 def test_pulses_through_the_middle_are_returns_or_pass_throughs(range_m, returns, pass_throughs):
     part = slice_towards(PLACE_M, offset_by(0.0, 0.0, 0.05), offset_by(0.0, 0.0, 0.3), range_m=range_m)
-    ((_, *found),) = table(PLACE_M).pass_throughs_of(part, np.zeros(3), NOW_NS, 0.11, 1.0)
+    ((_, *found),) = table(PLACE_M).pass_throughs_of(part, np.zeros(3), 0.11, 1.0)
     assert found == [returns, pass_throughs, False]
 
 
 def test_a_candidate_outside_the_fan_is_reported_as_outside():
     ((_, *found),) = table(PLACE_M).pass_throughs_of(
-        slice_towards([0.0, -1.0, 0.0], range_m=0.0), np.zeros(3), NOW_NS, 0.11, 1.0
+        slice_towards([0.0, -1.0, 0.0], range_m=0.0), np.zeros(3), 0.11, 1.0
     )
     assert found == [0, 0, True]
 
 
 def test_unpromising_old_and_uncertain_candidates_are_ignored():
     part = slice_towards(PLACE_M, range_m=0.0)
-    assert list(table(PLACE_M, promising=False).pass_throughs_of(part, np.zeros(3), NOW_NS, 0.11, 1.0)) == []
-    assert list(table(PLACE_M).pass_throughs_of(part, np.zeros(3), NOW_NS + 2 * 10**9, 0.11, 1e9)) == []
-    assert list(table(PLACE_M).pass_throughs_of(part, np.zeros(3), NOW_NS, 0.11, 1e-4)) == []
+    assert list(table(PLACE_M, promising=False).pass_throughs_of(part, np.zeros(3), 0.11, 1.0)) == []
+    later = slice_towards(PLACE_M, range_m=0.0, stamp_ns=NOW_NS + 2 * 10**9)
+    assert list(table(PLACE_M).pass_throughs_of(later, np.zeros(3), 0.11, 1e9)) == []
+    assert list(table(PLACE_M).pass_throughs_of(part, np.zeros(3), 0.11, 1e-4)) == []
 
 
 def test_first_within_returns_the_first_position_within_the_distance():

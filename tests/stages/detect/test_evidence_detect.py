@@ -181,13 +181,16 @@ def test_a_small_moving_object_in_the_free_sky_is_accepted_within_seconds(seed):
     assert evidence.candidate_id[0] == candidates[0].candidate_id[0]  # the same object keeps its number
 
 
-def test_slices_of_four_packets_give_the_same_result_as_single_packets():
+@pytest.mark.parametrize("packets", [4, 8])
+def test_slices_of_several_packets_give_the_same_result_as_single_packets(packets):
     drives_mps = (5.0, 0.0, 0.0)  # and so does the drone
-    (candidates, one), (together_4, four) = (run([Drone(MOVING)], drives_mps=drives_mps, packets=n) for n in (1, 4))
-    assert accepted_after_s(four) == pytest.approx(accepted_after_s(one), abs=0.1)
-    assert together_4[-1].scan_passes[0] == candidates[-1].scan_passes[0]
-    assert together_4[-1].seen_ns[0] == pytest.approx(candidates[-1].seen_ns[0], abs=6e6)
-    np.testing.assert_allclose(together_4[-1].xyz_vehicle_m[0], candidates[-1].xyz_vehicle_m[0], atol=0.05)
+    (candidates, one), (together, several) = (
+        run([Drone(MOVING)], drives_mps=drives_mps, packets=n) for n in (1, packets)
+    )
+    assert accepted_after_s(several) == pytest.approx(accepted_after_s(one), abs=0.1)
+    assert together[-1].scan_passes[0] == candidates[-1].scan_passes[0]
+    assert together[-1].seen_ns[0] == pytest.approx(candidates[-1].seen_ns[0], abs=1e6)
+    np.testing.assert_allclose(together[-1].xyz_vehicle_m[0], candidates[-1].xyz_vehicle_m[0], atol=0.03)
 
 
 def test_acceptance_has_a_hysteresis(monkeypatch):

@@ -35,15 +35,8 @@ def track(t, state: TrackingState, track_id=1, reason="made") -> TrackState:
 
 def rotation(t, R, sigma_rad=0.005) -> RelativeRotation:
     """One of four branches, not decided: the heading selects it."""
-    return RelativeRotation(
-        stamp_ns=ns(t),
-        R_vehicle_drone=R,
-        covariance_rad2=sigma_rad**2 * np.eye(3),
-        branch_probability=np.full(4, 0.24),
-        state=BranchState.AMBIGUOUS,
-        switches=0,
-        reason="made",
-    )
+    covariance = sigma_rad**2 * np.eye(3)
+    return RelativeRotation.one(ns(t), R, covariance, np.full(4, 0.24), BranchState.OPEN, 0, "made")
 
 
 def servo(t) -> ServoState:

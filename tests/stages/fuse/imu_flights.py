@@ -265,19 +265,9 @@ class ImuFlight:
             R = self.vehicle(t)[0].T @ rotation_z(branch * math.pi / 2) @ self.truth(t)[0] @ exp_rotation(e[k])
             if rng.random() < 0.02:
                 R = R @ exp_rotation(rng.normal(0, 0.5, 3))
-            yield (
-                t + 0.1,
-                "rotation",
-                RelativeRotation(
-                    stamp_ns=ns(t),
-                    R_vehicle_drone=R,
-                    covariance_rad2=(sigma**2 + math.radians(0.2) ** 2) * np.eye(3),
-                    branch_probability=np.full(4, 0.24),
-                    state=BranchState.AMBIGUOUS,
-                    switches=0,
-                    reason="made",
-                ),
-            )
+            covariance, branches = (sigma**2 + math.radians(0.2) ** 2) * np.eye(3), np.full(4, 0.24)
+            made = RelativeRotation.one(ns(t), R, covariance, branches, BranchState.OPEN, 0, "made")
+            yield t + 0.1, "rotation", made
 
     def _images(self) -> Iterator[tuple[float, str, Message]]:
         rng = np.random.default_rng([self.seed, 4])

@@ -260,9 +260,10 @@ def spinning(rate_radps, late_s, yaw_off_rad, sigma_rad):
     start = InertialState(
         rotation_z(yaw_rad + yaw_off_rad)[None], np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((1, 6)), P[None]
     )
+    estimator._cameras_confirmed = True
     estimator.graph.start(ns(2.5), start)
     message = rotation(2.5 - late_s, rotation_z(yaw_rad - rate_radps * late_s))
-    estimator.add(dataclasses.replace(message, covariance_rad2=np.diag(sigma_rad**2)))
+    estimator.add(dataclasses.replace(message, covariances_rad2=np.diag(sigma_rad**2)[None]))
     estimator.pass_time(ns(2.8))
     estimator.graph.advance(ns(2.75))
     state = estimator.graph.state

@@ -100,17 +100,6 @@ def test_one_measurement_excludes_no_hypothesis():
     assert bank.weight[6:].sum() > 1e-9
 
 
-def test_vanishing_points_leave_four_yaws_alike():
-    bank = start(np.zeros(3), 0.01 * np.eye(3), None, UP)
-    for _ in range(10):
-        measure.add_rotation(bank, rotation_z(0.3), np.eye(3), 1e-4 * np.eye(3))
-    bank.tidy()
-    yaw = np.remainder(bank.state.yaw_rad - 0.3, 0.5 * math.pi)
-    assert np.all(np.minimum(yaw, 0.5 * math.pi - yaw) < 0.05)
-    _, near = bank.yaws.best()
-    assert 0.2 < near < 0.35
-
-
 def test_a_direction_of_flight_selects_the_yaw():
     bank = start(np.zeros(3), 0.01 * np.eye(3), (np.array([3.0, 0.0, 0.0]), 0.2), UP)
     true = rotation_z(2.0)

@@ -269,10 +269,9 @@ def test_a_frozen_ego_motion_or_parked_vehicle_is_not_denied():
 @pytest.mark.parametrize(("reported", "denied"), [(1.0, 0), (0.0, 1), (1.2, 1)])
 def test_an_odometry_that_contradicts_the_lidar_is_denied(reported, denied):
     selector, out = VehicleMotionSelector(), []
-    for pulses, at_m in slices(5.0, 2.0, WALLS):
-        motion = VehicleMotion(
-            stamp_ns=pulses.middle_ns, xyz_map_m=reported * at_m, R_map_vehicle=np.eye(3), covariance=None
-        )
+    for pulses, (_, at_m) in slices(5.0, 2.0, WALLS):
+        last_ns = int(pulses.point_stamp_ns[-1])
+        motion = VehicleMotion(stamp_ns=last_ns, xyz_map_m=reported * at_m, R_map_vehicle=np.eye(3), covariance=None)
         out += [selector.on_odometry(motion), selector.on_pulses(pulses)]
     states = [m.status for m in out if m is not None]
     assert states.count(MotionStatus.DENIED) == denied

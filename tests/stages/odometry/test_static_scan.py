@@ -28,7 +28,7 @@ def cast(origin: np.ndarray, directions: np.ndarray, walls: list[tuple[int, floa
 
 
 def slices(speed_mps: float, seconds: float, walls: list[tuple[int, float]], seed: int = 1, yaw_rad: float = 0.3):
-    """(slice, position of the vehicle) along x; the fan's plane has the yaw `yaw_rad` against the motion."""
+    """(slice, positions of the vehicle at its ends) along x; the fan's plane has the yaw `yaw_rad` against the motion."""
     rng = np.random.default_rng(seed)
     for k in range(int(seconds / (FIRINGS * FIRING_S))):
         at_s = np.repeat((k * FIRINGS + np.arange(FIRINGS)) * FIRING_S, 16)
@@ -37,7 +37,7 @@ def slices(speed_mps: float, seconds: float, walls: list[tuple[int, float]], see
         fan[:, 2] *= np.cos(elevation)
         directions = fan @ rotation_z(yaw_rad).T
         origin = np.array([0.0, 0.0, 0.35])
-        position = np.array([speed_mps * at_s.mean(), 0.0, 0.0])
+        ends = tuple(np.array([speed_mps * t, 0.0, 0.0]) for t in (at_s[0], at_s[-1]))
         range_m = np.zeros(len(at_s))
         for row, t in enumerate(at_s[::16]):
             at = slice(16 * row, 16 * row + 16)
@@ -54,14 +54,17 @@ def slices(speed_mps: float, seconds: float, walls: list[tuple[int, float]], see
                 turntable_rad=0.0,
                 origin_vehicle_m=(0.0, 0.0, 0.35),
             ),
-            position,
+            ends,
         )
 
 
 def errors(speed_mps: float, reported: float, walls=WALLS, **scene) -> list[VelocityError]:
     """Velocity errors of an odometry that reports `reported` times the motion."""
     scan = StaticScan()
-    found = [scan.add(pulses, np.eye(3), reported * at_m) for pulses, at_m in slices(speed_mps, 1.2, walls, **scene)]
+    found = [
+        scan.add(pulses, *((np.eye(3), reported * at_m) for at_m in ends_m))
+        for pulses, ends_m in slices(speed_mps, 1.2, walls, **scene)
+    ]
     return [error for error in found if error is not None]
 
 

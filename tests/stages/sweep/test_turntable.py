@@ -33,11 +33,11 @@ def angle_rad(table, t_ns):
 
 
 def returns_of(table, packet):
-    return table.place(packet, table.turns(packet.pulse_stamp_ns))
+    return table.place(packet, table.turns(packet.pulse_stamp_ns))[0]
 
 
 def pulses_of(table, packet):
-    return table.pulses(packet, table.turns(packet.pulse_stamp_ns))
+    return table.place(packet, table.turns(packet.pulse_stamp_ns))[1]
 
 
 def test_the_angle_is_linear_between_the_neighbouring_states():
@@ -93,7 +93,7 @@ def test_a_point_is_turned_by_hand():
     placed = returns_of(table, firings([[0, 20, 0], [7, 0, 0], [0, 0, 9]]))
     expected = [[0, 0, 0.35 + 20], [0, 7, 0.35], [9, 0, 0.35]]  # lidar +z -> turntable -y -> vehicle +x
     np.testing.assert_allclose(placed.xyz_vehicle_m, expected, atol=1e-5)
-    np.testing.assert_allclose(placed.turntable_rad, math.pi / 2)
+    np.testing.assert_allclose(placed.servo_rad, math.pi / 2)
 
 
 def test_each_pulse_turns_with_the_angle_at_its_own_time():
@@ -103,7 +103,7 @@ def test_each_pulse_turns_with_the_angle_at_its_own_time():
     angle = np.array([0, math.pi / 4, math.pi / 2])
     expected = np.c_[10 * np.cos(angle), 10 * np.sin(angle), np.full(3, 0.35)]
     np.testing.assert_allclose(placed.xyz_vehicle_m, expected, atol=1e-5)
-    np.testing.assert_allclose(placed.turntable_rad, angle, atol=1e-6)
+    np.testing.assert_allclose(placed.servo_rad, angle, atol=1e-6)
 
 
 def test_the_whole_chain_equals_the_matrices():
@@ -116,13 +116,13 @@ def test_the_whole_chain_equals_the_matrices():
     Rz[:3, :3] = rotation_from_rpy_deg((0, 0, math.degrees(0.7)))
     T = T @ Rz @ mount.T_turntable_lidar.matrix()
     np.testing.assert_allclose(placed.xyz_vehicle_m, points @ T[:3, :3].T + T[:3, 3], atol=1e-4)
-    np.testing.assert_allclose(table.lidar_origin_vehicle_m(0.7), T[:3, 3])
+    np.testing.assert_allclose(placed.origin_vehicle_m, T[:3, 3])
 
 
 def test_only_returns_beyond_the_least_range_are_placed():
     table = turntable(states=[(0, 0.0), (10 * MS, 0.0)])
     placed = returns_of(table, firings([[0, 0, 0], [0.5, 0, 0], [0.7, 0, 0], [0, 0, 0], [3, 0, 0]]))
-    assert placed.pulse.tolist() == [2, 4]
+    np.testing.assert_allclose(np.linalg.norm(placed.xyz_vehicle_m - (0, 0, 0.35), axis=1), [0.7, 3.0], rtol=1e-6)
     assert placed.unplaced == 0
 
 
@@ -130,7 +130,7 @@ def test_returns_without_an_angle_are_counted_and_omitted():
     table = turntable(states=[(0, 0.0), (10 * MS, 0.0)])
     packet = firings([[5, 0, 0], [5, 0, 0], [0, 0, 0], [5, 0, 0]], START_NS + np.array([-1, 5, 20, 30]) * MS)
     placed = returns_of(table, packet)
-    assert placed.pulse.tolist() == [1]
+    assert placed.point_stamp_ns.tolist() == [START_NS + 5 * MS]
     assert placed.unplaced == 2  # the pulse without return lost nothing
 
 

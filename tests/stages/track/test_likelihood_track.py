@@ -433,9 +433,8 @@ def test_of_duplicate_tracks_the_younger_ends():
     for message in (accepted(here(elder), number=5), accepted(here(younger), number=9)):
         out += stage.on_detections(message)
     for pulses in pulses_seen([Drone(elder, seed=1), Drone(younger, seed=2)], WATCHING, 2.0):
-        both = [
-            one for one in stage._hypotheses if one.scan_pass and pulses.stamp_ns - one.scan_pass.last_ns > PASS_OVER_NS
-        ]
+        now_ns = int(pulses.point_stamp_ns[-1])
+        both = [one for one in stage._hypotheses if one.scan_pass and now_ns - one.scan_pass.last_ns > PASS_OVER_NS]
         if len(both) == 2 and pulses.stamp_ns > at_s(
             1.0
         ):  # both scan passes end now; the younger track moves to the elder's position

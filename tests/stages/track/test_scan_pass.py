@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from stages.kernels.geometry.so3 import exp_rotation
+from stages.kernels.sweep.pulses import cone_of
 from stages.kernels.track.hull import DEPTH, GAP_RETURN, KIND, RETURN, A
 from stages.messages import SweptPulses
 from stages.track.hull import COLUMNS
@@ -42,9 +43,9 @@ def test_a_drone_next_to_the_prediction_is_estimated_for_any_vehicle_attitude(ti
     R = exp_rotation(np.radians(tilt_deg).astype(np.float64))
     drone_m = EXPECTED_M + offset_m
     pulses = fan(R, drone_m)
-    axis = pulses.direction_vehicle.mean(axis=0).astype(np.float64)
+    pose, cone = (R, np.zeros(3)), cone_of(pulses.direction_vehicle)
     x, P = np.concatenate([EXPECTED_M, np.zeros(3)]), np.diag([0.2**2] * 3 + [1.0] * 3)
-    scan_pass = collect_into(None, pulses, R, np.zeros(3), axis, x, P, SPAN_M, True)
+    scan_pass = collect_into(None, pulses, (pose, pose), cone, x, P, SPAN_M, True)
     assert scan_pass is not None
     seen = evaluate(scan_pass, SPAN_M, 0.0, 0.8, True, 1.0)
     assert seen is not None

@@ -16,7 +16,7 @@ from stages.vp.spectrum import peaks, yaw_spectrum
 from stages.vp.verticals import propose_verticals, refine_vertical
 
 SIGMA = np.radians(0.25)
-LIMITS = SearchLimits(SIGMA, np.radians(0.05), 0.3, 3, 4, 7.0)
+LIMITS = SearchLimits(SIGMA, np.radians(0.05), 0.3, 3, 4, 7.0, 2.0, 4.0)
 UP = np.array([0.0, 0.0, 1.0])
 
 

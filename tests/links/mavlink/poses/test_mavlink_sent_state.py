@@ -38,12 +38,12 @@ def test_the_newest_pose_is_kept(tmp_path: Path):
     assert SentState(file, 7 * S).take_earlier() == (7 * S, b"\x03", None)  # not from the future
 
 
-def test_it_is_written_once_a_second(tmp_path: Path):
+def test_it_is_written_ten_times_a_second(tmp_path: Path):
     state = SentState(tmp_path / "sent.json", 0)
     for i in range(1, 100):
         state.on_sent(bytes([i]), i * S // 50)
         state.write()
-    assert SentState(tmp_path / "sent.json", 10 * S).take_earlier() == (51 * S // 50, bytes([51]), None)
+    assert SentState(tmp_path / "sent.json", 10 * S).take_earlier() == (96 * S // 50, bytes([96]), None)
 
 
 def test_a_damaged_file_counts_as_a_pose_sent_now_and_is_reported(tmp_path: Path):

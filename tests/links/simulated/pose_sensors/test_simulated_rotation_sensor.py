@@ -52,7 +52,7 @@ def test_rate_and_detection_are_as_set() -> None:
     found = measured(detection=1.0, rate_hz=4.0, duration_s=10.0)
     assert np.diff([r.stamp_ns for r in found]) == pytest.approx(250_000_000)
     assert len(measured(detection=0.5)) == pytest.approx(1000, rel=0.1)
-    assert all(r.state is BranchState.AMBIGUOUS and r.branch_probability == pytest.approx(0.25) for r in found)
+    assert all(r.state is BranchState.OPEN and r.branch_probability == pytest.approx(0.25) for r in found)
 
 
 def test_a_wrong_match_lasts_for_the_correlation_time_and_changes_the_branch() -> None:

@@ -74,7 +74,10 @@ def test_the_rig_sends_current_packets_and_its_rays_follow_the_servo(tmp_path, p
     )
     rig, ready = RealTimeRig(settings, tmp_path), threading.Event()
     sending = threading.Thread(target=rig.run, args=(ready,), daemon=True)
-    lidar, servo = Lidar(port=lidar_port, timeout_s=60), Servo(port=str(tmp_path / "servo"), start_timeout_s=60)
+    lidar, servo = (
+        Lidar(port=lidar_port, timeout_s=60, slice_ms=0.1),
+        Servo(port=str(tmp_path / "servo"), start_timeout_s=60),
+    )
     with lidar.listen() as packets:
         sending.start()
         assert ready.wait(PATIENCE_S)

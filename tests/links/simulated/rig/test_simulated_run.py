@@ -70,7 +70,7 @@ def test_the_bytes_put_the_drone_where_the_truth_has_it(short: Scenario) -> None
     truth = {
         topic: {r.stamp_ns: _T(r) for r in records if r.topic == topic} for topic in ("/truth/vehicle", "/truth/drone")
     }
-    lidar, near = Lidar(), []
+    lidar, near = Lidar(slice_ms=0.1), []  # a message per packet
     hits = np.array([*simulation.drone_return_ns, 2**62])
     for record in records:
         if record.topic != "/lidar/packets":
@@ -126,7 +126,7 @@ def test_dual_return_packets_hold_half_the_firings(short: Scenario) -> None:
     dual = short.changed(duration_s=0.1, lidar={"return_mode": "dual"})
     packets = [r for r in simulate_records(dual) if r.topic == "/lidar/packets"]
     assert len(packets) == -(-100_000_000 // 663_552)
-    lidar = Lidar()
+    lidar = Lidar(slice_ms=0.1)
     kinds = [set(firings.return_kind) for r in packets if (firings := lidar.decode(r)) is not None]
     assert len(kinds) == len(packets)
     assert {0, 1} in kinds

@@ -65,7 +65,7 @@ def test_each_drone_has_its_own_ground_truth_and_its_hits_are_on_it(pair: Scenar
     assert not set(hits[""]) & set(hits["_2"])
     assert sorted(hits[""] + hits["_2"]) == simulation.drone_return_ns
     away_m = {name: [] for name in hits}
-    lidar = Lidar()
+    lidar = Lidar(slice_ms=0.1)  # a message per packet
     for record in records:
         firings = lidar.decode(record) if record.topic == "/lidar/packets" else None
         if firings is None:

@@ -31,7 +31,8 @@ def _packet(mode: str, first_ns: int, azimuth_deg: float, range_m: np.ndarray, s
 
 
 def _decode(data: bytes, stamp_ns: int) -> LidarFirings:
-    firings = Lidar().decode(Record("/lidar/packets", arrival_ns=stamp_ns + 2_000_000, stamp_ns=stamp_ns, data=data))
+    record = Record("/lidar/packets", arrival_ns=stamp_ns + 2_000_000, stamp_ns=stamp_ns, data=data)
+    firings = Lidar(slice_ms=0.1).decode(record)
     assert firings is not None
     return firings
 

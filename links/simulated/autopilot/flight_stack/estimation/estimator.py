@@ -49,7 +49,8 @@ class Estimators:
         self._primary = 0
         self._resets: list[tuple[Array64, float]] = []
         delay = self._settings.viso_delay_ms
-        self.input = Px4Input(ekf2_ev_delay_ms=delay) if self._px4 else ArduPilotInput(viso_delay_ms=delay)
+        px4 = Px4Input(ekf2_ev_delay_ms=delay, compass=compass)
+        self.input = px4 if self._px4 else ArduPilotInput(viso_delay_ms=delay)
 
     def _core(self, sets: tuple[Sources, ...], yaw_rad: float | None) -> Ekf3:
         s = self._settings

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+from links.simulated.autopilot.rules import PoseResult
 from tests.links.simulated.autopilot.flight_stack.sent_truth import Host
 
 
@@ -27,6 +28,22 @@ def test_after_the_switch_it_hovers_on_what_it_is_sent(kind: str, sets: str) -> 
     assert "EKF failsafe" not in host.events()
     estimate = host.stack.ekf.output()
     np.testing.assert_allclose(estimate[0:2], host.stack.quadrotor.state[0:2], atol=0.2)  # map is the world here
+
+
+@pytest.mark.parametrize(("sets", "flies"), [(["gps", "external_position"], True), (["external_no_velocity"], False)])
+def test_px4_takes_positions_without_rotation_only_with_a_compass(sets: list[str], flies: bool) -> None:
+    plan = [{"do": "path", "for_s": 4}, *([{"do": "use_sources", "set": 2}] if flies else []), {"do": "hold", "for_s": 60}]
+    host = Host(16.0, kind="px4", source_sets=sets, plan=plan, autopilot={"heading_of_world_x_deg": 0.0})
+
+    def in_ned(message, time_s: float) -> None:
+        message.frame_id, message.q = 1, [math.nan] * 4
+
+    host.edit = in_ned
+    host.run(16.0)
+    fused = host.stack.ekf.input.results
+    assert (fused[PoseResult.FUSED] > 400) == flies
+    assert (fused[PoseResult.NOT_FINITE] > 400) != flies
+    assert not flies or host.scatter_m(8.0) < 0.25
 
 
 def test_a_wrong_position_moves_the_drone_the_other_way() -> None:

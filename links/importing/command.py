@@ -1,0 +1,84 @@
+"""`grd info`: what is in a file; `grd export`: a recording or a run as a ROS 2 bag.
+
+Source: ours.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.table import Table
+
+from flow.link import LinkError
+from links.cli.console import out, progress_bar, report_errors, show_table, warn
+
+MAX_FACT_CHARACTERS = 200
+
+
+@report_errors
+def info(
+    file: Annotated[Path, typer.Argument(help="A recording, a run's folder, or a file that `grd import` takes.")],
+    mapping: Annotated[
+        Path | None, typer.Option("--map", help="Write the mapping of a ROS bag as guessed, for `grd import --map`.")
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing mapping file.")] = False,
+) -> None:
+    """Show what is in a file: kind, span, topics, and what an import makes of them.
+
+    Example: grd info flight.bag --map mapping.yaml
+    """
+    from links.importing.info import file_info
+
+    found = file_info(file)
+    if mapping is not None:
+        if found.mapping is None:
+            raise LinkError(f"{file} is no ROS bag: only a bag has a mapping")
+        if mapping.exists() and not overwrite:
+            raise LinkError(f"{mapping} exists already: give another name with --map, or --overwrite")
+    for name, text in found.facts:
+        short = text if len(text) <= MAX_FACT_CHARACTERS else f"{text[:MAX_FACT_CHARACTERS]} ..."
+        out.print(f"{name}: {short}", markup=False)
+    table = Table(*found.columns)
+    for row in found.rows:
+        table.add_row(*row)
+    show_table(table)
+    for text in found.warnings:
+        warn(text)
+    if found.mapping is None:
+        return
+    if mapping is None:
+        out.print("mapping as guessed (`--map FILE` writes it, `grd import --map FILE` takes it):", markup=False)
+        out.print(found.mapping.yaml().rstrip() if found.mapping.uses else "nothing that grd can use", markup=False)
+    else:
+        mapping.write_text(found.mapping.yaml(), encoding="utf-8")
+        out.print(f"wrote {mapping}", markup=False)
+
+
+@report_errors
+def export(
+    source: Annotated[Path, typer.Argument(help="A recording, or the folder of a run.")],
+    out_folder: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder to write [default: next to SOURCE, NAME_ros2].")
+    ] = None,
+    recording: Annotated[
+        Path | None, typer.Option("--recording", help="Recording of the run, to add the sensors' data.")
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing bag.")] = False,
+) -> None:
+    """Write a recording or a run as a ROS 2 bag (MCAP) for RViz, Foxglove and ros2 bag play.
+
+    Example: grd export out/street_sweep-replay --recording recordings/street_sweep.mcap
+    """
+    from links.ros.export import export as write
+
+    if recording is not None and not source.is_dir():
+        raise LinkError("--recording adds the sensors' data to a run's folder: without it give the recording itself")
+    target = out_folder or source.absolute().parent / f"{source.absolute().stem}_ros2"
+    with progress_bar(f"export {source.name}") as step:
+        report = write(source, target, recording=recording, overwrite=overwrite, progress=step)
+    for text in report.warnings:
+        warn(text)
+    topics = ", ".join(f"{count} on {topic}" for topic, count in report.topics.items())
+    out.print(f"{report.path}: {topics}", markup=False)

@@ -1,0 +1,118 @@
+"""The fused poses of a run, read back from its files, and their errors against the truth.
+
+Source: ours; columns in links/runs/results.py. A live run of an hour has 180 000 poses: they are not kept in memory.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from links.evaluation.association import bracket, follow
+from links.runs.results import POSE_COVARIANCE_FILE, POSE_FILE, POSE_UPPER, UPPER_6
+from links.runs.truth import CHI2_95_3, MAX_GAP_NS, TruthLog
+
+Array64 = NDArray[np.float64]
+FULL = ("FULL", "COASTING")  # states with a position and a rotation
+
+
+@dataclass(frozen=True, slots=True)
+class FusedPoses:
+    """n poses with a known position. Angles and errors are NaN where the rotation or the truth is not known."""
+
+    stamps_ns: NDArray[np.int64]
+    state: NDArray[np.str_]
+    xyz_m: Array64  # (n, 3) vehicle axes
+    yaw_rad: Array64
+    sigma_m: Array64  # root of the position covariance's trace
+    sigma_rad: Array64  # root of the rotation covariance's trace
+    error_m: Array64  # (n, 3) pose - truth, vehicle axes
+    angle_rad: Array64  # between the pose's rotation and the true one
+    nees: Array64  # of the position; 3 on average when the covariance is consistent
+
+    @property
+    def full(self) -> NDArray[np.bool_]:
+        """Poses with a rotation (n,)."""
+        return np.isin(self.state, FULL)
+
+    @property
+    def rmse_xyz_m(self) -> Array64:
+        """Root mean square error of the position per axis (3,), of all poses with truth."""
+        return np.sqrt(np.nanmean(self.error_m**2, axis=0))
+
+    @property
+    def distance_m(self) -> Array64:
+        """Distance from the true position (n,)."""
+        return np.linalg.norm(self.error_m, axis=1)
+
+    @property
+    def has_truth(self) -> bool:
+        """Whether the truth is known for any pose."""
+        return bool(np.isfinite(self.error_m).any())
+
+    @property
+    def inside_95(self) -> float:
+        """Share of positions whose 95 % ellipsoid contains the truth."""
+        return float(np.mean(self.nees[np.isfinite(self.nees)] <= CHI2_95_3))
+
+
+def read_fused_poses(folder: Path, truth: TruthLog) -> FusedPoses | None:
+    """The poses in the folder of a run; None when there are none, or a full disk has cut the files off."""
+    try:
+        lines, rows = (
+            (folder / name).read_text("utf-8").splitlines()[1:] for name in (POSE_FILE, POSE_COVARIANCE_FILE)
+        )
+        if not lines or len(lines) != len(rows):
+            return None
+        poses = np.loadtxt(lines, usecols=range(1, 8), ndmin=2)
+        table = np.loadtxt(rows, dtype=str, delimiter=",", ndmin=2)
+    except (FileNotFoundError, ValueError):
+        return None
+    columns = ("stamp_s", *POSE_UPPER, "state", "accepted", "rotation", "resets", "nis", "measured_s", "track_id")
+    of = {name: table[:, index] for index, name in enumerate(columns)}
+    stamps_ns = np.array([int(text.replace(".", "")) for text in of["stamp_s"]], dtype=np.int64)
+    covariance = np.zeros((len(poses), 6, 6))
+    upper = table[:, 1 : 1 + len(POSE_UPPER)].astype(np.float64)
+    covariance[:, UPPER_6[0], UPPER_6[1]] = covariance[:, UPPER_6[1], UPPER_6[0]] = upper
+    rotated = of["rotation"] == "1"
+    R = Rotation.from_quat(poses[:, 3:])
+    position = R.as_matrix() @ covariance[:, 3:, 3:] @ np.swapaxes(R.as_matrix(), 1, 2)  # to vehicle axes
+    error_m, angle_rad = _errors(stamps_ns, poses[:, :3], R, of["track_id"].astype(np.int64), truth)
+    unknown = np.where(rotated, 1.0, np.nan)
+    return FusedPoses(
+        stamps_ns=stamps_ns,
+        state=of["state"],
+        xyz_m=poses[:, :3],
+        yaw_rad=unknown * R.as_euler("ZYX")[:, 0],
+        sigma_m=np.sqrt(np.trace(position, axis1=1, axis2=2)),
+        sigma_rad=unknown * np.sqrt(np.trace(covariance[:, :3, :3], axis1=1, axis2=2)),
+        error_m=error_m,
+        angle_rad=unknown * angle_rad,
+        nees=np.einsum("ni,ni->n", error_m, np.linalg.solve(position, error_m[..., None])[..., 0]),
+    )
+
+
+def _errors(
+    stamps_ns: NDArray[np.int64], xyz_m: Array64, R: Rotation, tracks: NDArray[np.int64], truth: TruthLog
+) -> tuple[Array64, Array64]:
+    """Errors of the positions (n, 3) and of the rotations (n,), against the drone that each track follows."""
+    error_m, angle_rad = np.full((len(xyz_m), 3), np.nan), np.full(len(xyz_m), np.nan)
+    numbers = [number for number, drone in sorted(truth.drones.items()) if drone.pose]
+    paths = [truth.drone_in_vehicle(number) for number in numbers]
+    if not any(len(path[0]) for path in paths):
+        return error_m, angle_rad
+    followed = follow(stamps_ns, xyz_m, tracks, paths, MAX_GAP_NS).drone
+    for index, (number, (true_ns, true_m)) in enumerate(zip(numbers, paths, strict=True)):
+        own = np.flatnonzero(followed == index)
+        between = bracket(stamps_ns[own], true_ns, MAX_GAP_NS)
+        rows, before, after = own[between.known], between.before[between.known], between.after[between.known]
+        weight = between.weight[between.known][:, None]
+        error_m[rows] = xyz_m[rows] - ((1 - weight) * true_m[before] + weight * true_m[after])
+        R_true = Rotation.from_quat(truth.rotation_in_vehicle(number))
+        step = (R_true[before].inv() * R_true[after]).as_rotvec()
+        angle_rad[rows] = (R[rows].inv() * R_true[before] * Rotation.from_rotvec(weight * step)).magnitude()
+    return error_m, angle_rad

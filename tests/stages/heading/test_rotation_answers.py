@@ -1,0 +1,101 @@
+"""Several answers of both cameras as one measurement: of the bank of yaw hypotheses, and of a decided heading."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from stages.geometry.frames import rotation_z
+from stages.heading.inertial_bank import InertialBank, start
+from stages.heading.inertial_state import THETA, InertialState
+from stages.heading.rotation_answers import Answers, add_answers, combine
+from stages.kernels.geometry.so3 import exp_rotation
+
+UP = np.array([0.0, 0.0, 1.0])
+QUARTER = math.pi / 2
+
+
+def answers(*yaws_deg: float, p=(0.9,), sigma_deg=0.3, tilt_deg=0.0) -> Answers:
+    R = np.array([rotation_z(math.radians(yaw)) @ exp_rotation(np.radians([tilt_deg, 0, 0])) for yaw in yaws_deg])
+    return Answers(R, np.tile(math.radians(sigma_deg) ** 2 * np.eye(3), (len(R), 1, 1)), np.array(p), np.eye(3))
+
+
+def any_yaw() -> InertialBank:
+    return start(np.zeros(3), 0.01 * np.eye(3), None, UP)
+
+
+def near(bank: InertialBank, yaw_deg: float, reach_deg: float = 2.0) -> float:
+    """Probability of the hypotheses that are narrow and near a yaw, on any branch."""
+    off = np.remainder(bank.state.yaw_rad - math.radians(yaw_deg) + QUARTER / 2, QUARTER) - QUARTER / 2
+    narrow = np.sqrt(bank.state.yaw_variance_rad2) < math.radians(5)
+    return float(bank.weight[narrow & (np.abs(off) < math.radians(reach_deg))].sum())
+
+
+def decided(yaw_deg=0.0, sigma_deg=3.0) -> InertialState:
+    P = np.eye(15)[None] * 1e-2
+    P[:, THETA, THETA] = math.radians(sigma_deg) ** 2 * np.eye(3)
+    return InertialState(rotation_z(math.radians(yaw_deg))[None], *np.zeros((2, 1, 3)), np.zeros((1, 6)), P)
+
+
+def test_one_answer_leaves_four_equally_probable_branches_and_the_case_that_it_is_wrong():
+    bank = any_yaw()
+    right = add_answers(bank, answers(20.0), 1.0)
+    assert right == pytest.approx(0.9, abs=0.05)
+    assert near(bank, 20.0) == pytest.approx(0.9, abs=0.05)
+    for k in range(4):
+        off = np.abs(np.remainder(bank.state.yaw_rad - math.radians(20 + 90 * k) + math.pi, 2 * math.pi) - math.pi)
+        narrow = np.sqrt(bank.state.yaw_variance_rad2) < math.radians(5)
+        assert bank.weight[narrow & (off < 0.05)].sum() == pytest.approx(0.225, abs=0.02)
+
+
+def test_two_answers_share_the_probability_as_stated():
+    bank = any_yaw()
+    add_answers(bank, answers(20.0, 54.0, p=(0.6, 0.3)), 1.0)
+    assert near(bank, 20.0) == pytest.approx(0.6, abs=0.05)
+    assert near(bank, 54.0) == pytest.approx(0.3, abs=0.05)
+
+
+def test_images_that_repeat_the_same_answer_do_not_make_it_more_probable():
+    """A wrong match repeats itself in all images of a street."""
+    bank = any_yaw()
+    add_answers(bank, answers(20.0), 1.0)
+    for _ in range(50):
+        add_answers(bank, answers(20.0), 0.1)
+    assert near(bank, 20.0) == pytest.approx(0.9, abs=0.05)
+    assert bank.weight[bank.tied].sum() == pytest.approx(0.9, abs=0.05)
+    assert np.sqrt(bank.state.yaw_variance_rad2[~bank.tied]).min() > math.radians(10)  # the free ones use no image
+
+
+def test_an_answer_that_returns_more_often_wins_among_the_tied_hypotheses():
+    bank = any_yaw()
+    add_answers(bank, answers(20.0, 54.0, p=(0.45, 0.45)), 1.0)
+    for _ in range(20):
+        add_answers(bank, answers(54.0), 0.2)
+    assert near(bank, 54.0) > 5 * near(bank, 20.0)
+    assert bank.weight[bank.tied].sum() == pytest.approx(0.9, abs=0.05)
+
+
+def test_an_answer_with_another_tilt_is_not_used():
+    bank = any_yaw()
+    assert add_answers(bank, answers(20.0, tilt_deg=25.0), 1.0) == 0.0
+    assert near(bank, 20.0) == 0.0
+
+
+def test_a_decided_heading_takes_the_answer_that_agrees_and_ignores_others():
+    one = combine(decided(1.0), answers(34.0, 0.0 + 90, p=(0.7, 0.25)))
+    assert one.R_map_drone is not None
+    assert math.degrees(math.atan2(one.R_map_drone[1, 0], one.R_map_drone[0, 0])) == pytest.approx(0.0, abs=0.2)
+
+
+def test_two_answers_that_both_agree_have_a_covariance_that_covers_both():
+    one = combine(decided(0.0, 6.0), answers(-6.0, 6.0, p=(0.45, 0.45)))
+    assert one.R_map_drone is not None
+    assert math.degrees(math.sqrt(one.spread_rad2[2, 2])) > 5.5
+
+
+def test_an_answer_that_contradicts_a_decided_heading_is_rejected():
+    one = combine(decided(0.0, 1.0), answers(20.0))
+    assert one.R_map_drone is None
+    assert math.degrees(abs(one.residual_rad[2])) == pytest.approx(20.0, abs=0.1)

@@ -22,7 +22,7 @@ COMMANDS = {
     "check": ("graphs:check", "Report all errors of CONFIG and of the hosts file."),
     "graph": ("graphs:graph", "Draw the graph of CONFIG."),
     "schema": ("graphs:schema", "Write the JSON Schema of the YAML files, for editors."),
-    "import": ("files:import_recording", "Convert a capture or a telemetry log to a recording."),
+    "import": ("files:import_recording", "Convert a capture, a telemetry log or a ROS bag to a recording."),
     "info": ("links.importing.command:info", "Show what is in a file: kind, span, topics"),
     "export": ("links.importing.command:export", "Write a recording or a run as a ROS 2 bag (MCAP)."),
     "recover": ("files:recover_recording", "Make a clean copy of a damaged recording."),
@@ -33,6 +33,10 @@ COMMANDS = {
     "preflight": ("preflight:preflight", "Check LiDAR, servo, cameras, autopilot, clocks, parameters, axes and disk."),
     "calibrate": ("calibrate:calibrate_recording", "Estimate the LiDAR's mount on its servo."),
     "lens": ("lens:import_lens", "Write the lens in FILE as a rig file, to include in a configuration after its rig."),
+    "train-detector": (
+        "links.training.command:train_detector",
+        "Train the detector's model and score it on held-out runs.",
+    ),
     "evaluate": ("evaluate:evaluate_runs", "Evaluate runs against truth."),
     "verify": ("verify:verify", "Replay the committed recordings and compare their output hashes."),
 }

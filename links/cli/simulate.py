@@ -109,6 +109,11 @@ def simulate_matrix(
     ] = False,
     odometry: Annotated[bool, typer.Option("--odometry", help="The vehicle sends odometry.")] = False,
     rain: Annotated[bool, typer.Option("--rain", help="Rain of 5 mm/h.")] = False,
+    sparse: Annotated[bool, typer.Option("--sparse", help="Fewer rays per LiDAR pulse, in half the time.")] = False,
+    varied_sky: Annotated[
+        bool,
+        typer.Option("--varied-sky", help="Gliding, circling and hovering birds, flocks, insects, kites, bags."),
+    ] = False,
     lidar: Annotated[
         str, typer.Option("--lidar", metavar="MODEL", help="LiDAR of the rig, as `rig.lidar.model`: XT32, OS1-64, ...")
     ] = "VLP-16",
@@ -187,7 +192,17 @@ def simulate_matrix(
     if lidar not in LIDAR_MODELS:
         raise LinkError(f"--lidar {lidar}: not one of {', '.join(LIDAR_MODELS)}")
     conditions = Conditions(
-        calibrated, odometry, rain, autopilot, cameras_hz, size_px, readout_ms or 0.0, lidar, perturbed
+        calibrated,
+        odometry,
+        rain,
+        autopilot,
+        cameras_hz,
+        size_px,
+        readout_ms or 0.0,
+        lidar,
+        perturbed,
+        sparse,
+        varied_sky,
     )
     several = range(first_seed, first_seed + seeds)
     with progress_bar(f"{len(selected) * seeds} recordings") as step:

@@ -26,7 +26,7 @@ from links.runs.result_file import ResultFile
 from stages.geometry.frames import quaternions_xyzw
 from stages.messages import (
     CandidateEvidence,
-    Candidates,
+    CandidateLog,
     DepthImage,
     Detections,
     DroneFix,
@@ -55,7 +55,7 @@ POSE_UPPER = tuple(f"c{a}{b}" for a in range(6) for b in range(a, 6))  # rotatio
 POSE_HEAD = "# T_vehicle_drone, fused; '0 0 0 1' where the rotation is unknown: the covariance table has rotation 0\n"
 UNKNOWN_RAD2 = math.pi**2  # variance of an unknown rotation in the table, which has no infinity
 UPPER_3, UPPER_6 = np.triu_indices(3), np.triu_indices(6)
-WRITTEN = (DroneFix, DepthImage, Detections, Candidates, TrackState, RelativeRotation, RelativePose)
+WRITTEN = (DroneFix, DepthImage, Detections, CandidateLog, TrackState, RelativeRotation, RelativePose)
 
 
 def drone_file(name: str, number: int) -> str:
@@ -106,8 +106,6 @@ class Results(Tap[ResultsSettings]):
         self._covariance: Any = None
         self._detections: Any = None
         self._candidates: Any = None
-        self._observations: dict[int, int] = {}  # of the newest candidates, by number
-        self._detector_life: int = 0
         self._rotations: Any = None
         self._poses: Any = None
         self._sweep_start_ns: dict[int, int] = {}  # of the newest depth image, by its stamp
@@ -197,7 +195,7 @@ class Results(Tap[ResultsSettings]):
             self._searches[message.result] += 1
             self._examples.setdefault(message.result, message.summary)
             self._log(message.stamp_ns, output, message.summary)
-        elif isinstance(message, Candidates):
+        elif isinstance(message, CandidateLog):
             self._write_candidates(message)
         elif isinstance(message, TrackState):
             self._note_state(output, message)
@@ -233,24 +231,18 @@ class Results(Tap[ResultsSettings]):
         lines = [[*span, *(f"{v:.4f}" for v in xyz), f"{score:.6g}"] for xyz, score in accepted]
         self._detections.writerows(lines or [[*span, "", "", "", ""]])
 
-    def _write_candidates(self, message: Candidates) -> None:
-        """Write a line per candidate with a new observation: its position and the probability that it is a drone."""
+    def _write_candidates(self, message: CandidateLog) -> None:
+        """Write a line per classified candidate: position, probability that it is a drone, and its features."""
         if self._candidates is None:
             self._files[CANDIDATES_FILE] = self._file(CANDIDATES_FILE)
             self._candidates = csv.writer(self._files[CANDIDATES_FILE])
-            head = ["stamp_s", "candidate", "detector_instance", "observations", "probability", "x_m", "y_m", "z_m"]
-            self._candidates.writerow(head)
-        before = self._observations if message.detector_instance == self._detector_life else {}
-        numbers, observations = message.candidate_id.tolist(), message.scan_passes.tolist()
-        self._observations, self._detector_life = (
-            dict(zip(numbers, observations, strict=True)),
-            message.detector_instance,
-        )
-        for i, number in enumerate(numbers):
-            if observations[i] != before.get(number):
-                values = [number, message.detector_instance, observations[i], f"{message.probability[i]:.6g}"]
-                xyz = [f"{v:.4f}" for v in message.xyz_vehicle_m[i].tolist()]
-                self._candidates.writerow([stamp_s(message.stamp_ns), *values, *xyz])
+            head = ["stamp_s", "candidate", "detector_instance", "probability", "x_m", "y_m", "z_m"]
+            self._candidates.writerow([*head, *message.feature_names])
+        for i, number in enumerate(message.candidate_id.tolist()):
+            xyz = [f"{v:.3f}" for v in message.xyz_vehicle_m[i].tolist()]
+            features = ["" if math.isnan(v) else f"{v:.5g}" for v in message.features[i].tolist()]
+            values = [number, message.detector_instance, f"{message.probability[i]:.6g}", *xyz, *features]
+            self._candidates.writerow([stamp_s(int(message.seen_ns[i])), *values])
 
     def _write_rotation(self, output: str, message: RelativeRotation) -> None:
         """Write a line per message, also without a rotation; log changes of the state and of the yaw branch."""

@@ -16,6 +16,7 @@ import numpy as np
 
 from stages.detect.flight import Motion, fit_motion, lamp_sway_m, moves, wire_sway_m
 from stages.detect.motion_log_ratios import DENIED, MotionLogRatios
+from stages.detect.trained.existence import LEAST_FALSE_PER_S, observed_nats, survived_nats
 from stages.geometry.frames import Array64
 from stages.kernels.detect.candidate import ACCELERATION_MPS2, SIGMA_M, neighbour_score
 from stages.kernels.detect.isolation import SECTORS
@@ -57,6 +58,7 @@ class Observation:
     rough_chords: int  # chords with enough returns to bulge smoothly that do not
     isolation: Array64  # (TALLY,) sector counts, see stages/detect/isolation.py
     large_object_m: float  # distance to the nearest large object; inf: none
+    extent_m: float = 0.0  # largest distance between its chords, or length of one
 
 
 @dataclass(slots=True, eq=False)
@@ -72,6 +74,15 @@ class Candidate:
     first_returns: int
     scan_passes: int = 1  # passes of the rotor in which it was observed
     missed_returns: float = 0.0  # expected returns that did not come
+    born_ns: int = 0  # its first observation
+    existence_nats: float = 0.0  # log-odds that one object causes its observations, see trained/existence.py
+    false_per_s: float = LEAST_FALSE_PER_S  # rate of false returns at its range, at its last observation
+    passed_pulses: float = 0.0  # pulses through its middle in scan passes without a return
+    observations: int = 0
+    single_returns: int = 0  # observations with one return
+    total_extent_m: float = 0.0  # sum and largest of its observations
+    largest_extent_m: float = 0.0
+    features: Array64 = field(default_factory=lambda: np.zeros(0))  # at its newest classification
     returns: int = 0
     too_long_passes: int = 0
     return_count_nats: float = 0.0  # log ratio drone over wire of the numbers of returns
@@ -128,6 +139,9 @@ class Candidate:
         x = self.xyz_m + dt * self.velocity_mps
         gain_x, gain_v = a / (a + SIGMA_M**2), b / (a + SIGMA_M**2)
         innovation = s.xyz_map_m - x
+        self.existence_nats = survived_nats(self.existence_nats, dt) + observed_nats(
+            float(innovation @ innovation), a + SIGMA_M**2, s.range_m, s.returns, self.false_per_s
+        )
         self.xyz_m = x + gain_x * innovation
         self.velocity_mps = self.velocity_mps + gain_v * innovation
         self.p = (1 - gain_x) * a, (1 - gain_x) * b, c - gain_v * b
@@ -138,6 +152,10 @@ class Candidate:
 
     def add_observation(self, s: Observation) -> None:
         """Add the evidence of one observation, without the filter update."""
+        self.observations += 1
+        self.single_returns += s.returns == 1
+        self.total_extent_m += s.extent_m
+        self.largest_extent_m = max(self.largest_extent_m, s.extent_m)
         self.returns += s.returns
         self.too_long_passes += s.too_long
         alone = min(max(SINGLE_RETURN_PER_M * s.range_m, 0.1), 0.7)

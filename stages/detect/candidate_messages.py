@@ -12,9 +12,28 @@ from collections.abc import Iterable
 import numpy as np
 
 from stages.detect.candidate import Candidate
+from stages.detect.trained.features import NAMES
 from stages.geometry.frames import Array64
 from stages.geometry.trajectory import VehicleTrajectory
-from stages.messages import CandidateEvidence, Candidates, Detections
+from stages.messages import CandidateEvidence, CandidateLog, Candidates, Detections
+
+
+def candidate_log(
+    classified: Iterable[Candidate], trail: VehicleTrajectory, now_ns: int, detector_instance: int
+) -> CandidateLog:
+    """The classified candidates of a slice, each at its last observation."""
+    listed = list(classified)
+    seen = [trail.to_vehicle(c.seen_ns, c.path_m[-1], c.velocity_mps)[0] for c in listed]
+    return CandidateLog(
+        stamp_ns=now_ns,
+        candidate_id=np.array([c.number for c in listed], dtype=np.int64),
+        seen_ns=np.array([c.seen_ns for c in listed], dtype=np.int64),
+        xyz_vehicle_m=np.array(seen).reshape(-1, 3),
+        probability=np.array([probability(c.log_odds) for c in listed], dtype=np.float64),
+        features=np.array([c.features for c in listed]),
+        feature_names=NAMES,
+        detector_instance=detector_instance,
+    )
 
 
 def probability(log_odds: float) -> float:

@@ -26,13 +26,16 @@ from pydantic import Field, model_validator
 
 from flow.stage import Settings, Stage
 from stages.detect.candidate import SAME_PASS_NS, START_SPEED_MPS, STATIC_M, Alternative, Candidate, Observation
-from stages.detect.candidate_messages import candidates_message, detections_message, log_odds_of
+from stages.detect.candidate_messages import candidate_log, candidates_message, detections_message, log_odds_of
 from stages.detect.candidate_table import CandidateTable, positions_of
 from stages.detect.classifier import ClassifierWeights, classify
 from stages.detect.isolation import LargeObjectMap
 from stages.detect.observations import ObservationFinder, ObservationLimits, Slice
 from stages.detect.reacquire import reacquired_candidate, without_duplicates
 from stages.detect.telemetry import DetectorTelemetry
+from stages.detect.trained.existence import FalseReturns, birth_nats, passed_nats
+from stages.detect.trained.features import features_of
+from stages.detect.trained.model import DetectorModel
 from stages.geometry.frames import Array64
 from stages.geometry.rig_lidar import RigLidar
 from stages.geometry.trajectory import VehicleTrajectory
@@ -40,6 +43,7 @@ from stages.kernels.detect.candidate import SIGMA_M
 from stages.kernels.detect.candidate_table import first_within
 from stages.kernels.sweep.pulses import cone_of
 from stages.messages import (
+    CandidateLog,
     Candidates,
     Detections,
     DroneLocalPosition,
@@ -80,6 +84,8 @@ class _State:
     static: deque[Candidate] = field(default_factory=lambda: deque[Candidate](maxlen=MAX_STATIC))
     static_m: Array64 = field(default_factory=lambda: np.empty((0, 3)))  # their positions
     rejected_map: LargeObjectMap = field(default_factory=LargeObjectMap)
+    false_returns: FalseReturns = field(default_factory=FalseReturns)
+    classified: dict[int, Candidate] = field(default_factory=dict[int, Candidate])  # in this slice
     watches: dict[int, _Watch] = field(default_factory=lambda: dict[int, _Watch]())
     rejected: Counter[str] = field(default_factory=Counter[str])
     pruned_ns: int = 0
@@ -109,6 +115,7 @@ class EvidenceDetectSettings(Settings):
     parked: bool = False  # the vehicle does not move: motion is known without VehicleMotion
     free_space: bool = True  # ablation: False ignores the measured surroundings
     weights: ClassifierWeights = ClassifierWeights()  # log likelihood ratios of the classifier
+    model: DetectorModel | None = None  # trained by `grd train-detector`; null: the classifier by `weights`
 
     @model_validator(mode="after")
     def _settings_agree(self) -> EvidenceDetectSettings:
@@ -147,7 +154,7 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
         """Add the drone's odometry, from an autopilot that sends it."""
         self._now.telemetry.add_odometry(odometry)
 
-    def on_pulses(self, pulses: SweptPulses) -> Iterator[Candidates | Detections]:
+    def on_pulses(self, pulses: SweptPulses) -> Iterator[CandidateLog | Candidates | Detections]:
         """Process one slice: classify the observations that it completes and publish changes."""
         if pulses.range_m.size == 0:
             return
@@ -165,6 +172,9 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
             changed = self._prune(now, now_ns)
         for observation in observations:
             changed |= self._associate(now, observation)
+        if now.classified:
+            yield candidate_log(now.classified.values(), now.trail, now_ns, now.detector_instance)
+            now.classified.clear()
         yield from self._report(now, now_ns, pulses.turntable_rad, changed)
 
     def _motion_known(self, stamp_ns: int) -> bool:
@@ -195,7 +205,10 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
             range_m=s.range_m,
             p=(SIGMA_M**2, 0.0, START_SPEED_MPS**2),
             first_returns=s.returns,
+            born_ns=s.stamp_ns,
+            false_per_s=now.false_returns.per_s(s.range_m, s.stamp_ns),
         )
+        new.existence_nats = birth_nats(new.false_per_s)
         new.near_rejected, new.revisited = near_rejected, rejected_m < REVISITED_M and now.telemetry.moves(s.stamp_ns)
         new.add_observation(s)
         changed = self._classify(now, new)
@@ -204,11 +217,13 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
             now.table.put(new)
         else:
             now.rejected[new.rejection] += 1
+            now.false_returns.add(new.range_m, new.seen_ns)
             self._remember_rejected(now, new)
         return changed
 
     def _update(self, now: _State, c: Candidate, s: Observation) -> bool:
         """Update a candidate with an observation. True: publish a change."""
+        c.false_per_s = now.false_returns.per_s(s.range_m, s.stamp_ns)
         c.update(s)
         changed = self._classify(now, c)
         now.table.put(c)
@@ -242,6 +257,10 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
         motion_known = self._motion_known(c.seen_ns)
         c.add_log_ratios(now.telemetry.of(c, motion_known))
         c.log_odds, c.reason = classify(c, settings.weights, settings.free_space, motion_known)
+        c.features = features_of(c, settings.span_m, motion_known)
+        if settings.model is not None:
+            c.log_odds, c.reason = settings.model.classify(c)
+        now.classified[c.number] = c
         accept = log_odds_of(settings.accept_probability)
         c.accepted = c.log_odds >= accept or (c.accepted and c.log_odds >= accept - HYSTERESIS_NATS)
         before, c.is_promising = c.is_promising, c.log_odds >= log_odds_of(settings.follow_up_probability)
@@ -263,6 +282,8 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
             watch = now.watches.get(c.number)
             if watch is not None and now_ns - watch.stamp_ns > SAME_PASS_NS:
                 if watch.returns == 0 and now_ns - c.seen_ns > 2 * SAME_PASS_NS:
+                    c.passed_pulses += watch.pass_throughs
+                    c.existence_nats += passed_nats(c.range_m, watch.pass_throughs)
                     c.missed_returns += watch.pass_throughs * min(1.0, (35.0 / c.range_m) ** 2)
                     self._classify(now, c)
                     now.table.put(c)
@@ -274,8 +295,11 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
             return self._reset(now)
         kept = without_duplicates(c for c in now.table if now_ns - c.seen_ns < self._retention_ns(c))
         for c in now.table:
-            if now_ns - c.seen_ns >= self._retention_ns(c) and not c.is_promising:
-                self._remember_rejected(now, c)
+            if now_ns - c.seen_ns >= self._retention_ns(c):
+                if c.scan_passes == 1:
+                    now.false_returns.add(c.range_m, now_ns)
+                if not c.is_promising:
+                    self._remember_rejected(now, c)
         if self._motion_known(now_ns):
             now.static.extend(c for c in now.table if now_ns - c.seen_ns >= self._retention_ns(c) and c.is_static)
         while now.static and now_ns - now.static[0].seen_ns > STATIC_NS:

@@ -24,6 +24,7 @@ from stages.messages.cameras import VanishingDirections as VanishingDirections
 from stages.messages.cameras import VisualMotion as VisualMotion
 from stages.messages.drone import AutopilotMotion as AutopilotMotion
 from stages.messages.drone import CandidateEvidence as CandidateEvidence
+from stages.messages.drone import CandidateLog as CandidateLog
 from stages.messages.drone import Candidates as Candidates
 from stages.messages.drone import Detections as Detections
 from stages.messages.drone import DroneFix as DroneFix

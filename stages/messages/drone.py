@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import enum
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flow.message import Mat3, Message, PerPointBool, PerPointF64, PerPointI64, Points64, Vec3, message
+from flow.message import Mat3, Message, PerPointBool, PerPointF64, PerPointI64, Points64, Shape, Vec3, message
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -84,6 +85,19 @@ class Candidates(Message):
         None  # horizontal speed by telemetry whose direction is unknown; not in velocity_vehicle_mps
     )
     detector_instance: int = 0  # changes when the detector restarts: candidate_id then counts from the start
+
+
+@message(schema=88)
+class CandidateLog(Message):
+    """Every candidate that was classified in a slice, with the features that it was classified by; for logs."""
+
+    candidate_id: PerPointI64  # as in Detections
+    seen_ns: PerPointI64  # its last observation
+    xyz_vehicle_m: Points64  # at seen_ns
+    probability: PerPointF64
+    features: Annotated[NDArray[np.float64], Shape("n", "k")]  # trained/features.py; NaN: not available
+    feature_names: tuple[str, ...]
+    detector_instance: int = 0
 
 
 class TrackingState(enum.Enum):

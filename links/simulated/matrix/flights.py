@@ -188,6 +188,9 @@ def motions(cell: Cell, azimuth: float, elevation: float) -> Iterator[Motion]:
     elif cell.motion == "climb":
         rise = min(2.0 * duration, 0.5 * reach)
         yield lambda t: centre + np.outer(rise * (t / duration - 0.5), up)
+    elif cell.motion == "wander":
+        for attempt in range(4):
+            yield _wander(centre, duration, np.random.default_rng([int(1e6 * azimuth), int(1e6 * elevation), attempt]))
     elif cell.motion == "return":
         there = np.clip(np.array([4.0, 11.5, 14.0, 21.5]), 0, duration)
         yield lambda t: centre * (1 + np.outer(np.interp(t, there, [0, 1, 1, 0]), (FAR_M - reach) / reach * np.ones(3)))
@@ -197,6 +200,22 @@ def motions(cell: Cell, azimuth: float, elevation: float) -> Iterator[Motion]:
             middle = 0.6 * duration
             knots = [middle - wait_s / 2 - 2.5, middle - wait_s / 2, middle + wait_s / 2, middle + wait_s / 2 + 2.5]
             yield lambda t, k=knots, turn=turn: around(azimuth + np.interp(t, k, [0, turn, turn, 0]), radius, height)
+
+
+def _wander(centre: Array64, duration_s: float, rng: Generator) -> Motion:
+    """Random flight about a centre at up to 1 to 12 m/s: a sum of sines on each axis, less along the vertical."""
+    top_mps = rng.uniform(1.0, 12.0)
+    rate = rng.uniform(0.15, 0.7, (3, 3))  # [rad/s]
+    phase = rng.uniform(0, 2 * np.pi, (3, 3))
+    share = rng.dirichlet(np.ones(3), 3) * np.array([[1.0], [1.0], [0.25]])
+    amplitude = np.minimum(top_mps * share / rate, 0.35 * np.linalg.norm(centre))
+
+    axes = list(zip(rate, phase, amplitude, strict=True))
+
+    def motion(t: Array64) -> Array64:
+        return centre + np.stack([np.sin(np.outer(t, w) + p) @ a for w, p, a in axes], axis=1)
+
+    return motion
 
 
 def around(azimuth_rad: Array64, radius_m: float, height_m: float) -> Array64:

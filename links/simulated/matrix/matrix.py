@@ -39,6 +39,7 @@ VEHICLES = ("parked", "driving", "turning")
 SCENES: tuple[Kind, ...] = ("manhattan", "atlanta", "campus", "park_edge", "open_lot")
 OPEN: Kind = "open_lot"  # has no obstacle that could hide a drone
 SPECIALS = {"occlusion": 35, "return": 20}  # motion: range
+SECOND: Kind = "village"  # the second generator, only where a pattern names it
 SPECIAL_CELLS = (  # range, motion, vehicles; in every scene where they are possible
     (0, "empty", VEHICLES),
     (20, "occlusion", ("parked",)),
@@ -69,6 +70,8 @@ class Conditions:
     readout_ms: float = 0.0  # of their rolling shutter, first to last row; 0: global shutter
     lidar: LidarModel = "VLP-16"
     perturbed: bool = False  # the rig differs from its file, and the kind of drone varies between flights
+    sparse: bool = False  # fewer rays per pulse: half the time
+    varied_sky: bool = False  # movers of `links/simulated/world/sky_movers.py`
 
 
 def cells(only: Sequence[str] = ("*",), pairs: bool = False) -> list[Cell]:
@@ -87,6 +90,11 @@ def cells(only: Sequence[str] = ("*",), pairs: bool = False) -> list[Cell]:
     found.extend(_in_every_scene(SPECIALS["occlusion"], "occlusion", ("parked",)))
     if not pairs:
         found.extend(chain.from_iterable(_in_every_scene(*special) for special in SPECIAL_CELLS))
+    if not pairs and any("wander" in pattern or pattern.startswith(SECOND) for pattern in only):
+        wandering = product((*SCENES, SECOND), (10, 20, 30, 40), ("wander",), VEHICLES)
+        second = product((SECOND,), (20, 30, 40), ("hover",), VEHICLES)
+        found += [Cell(*values) for values in (*wandering, *second)]
+        found += [Cell(SECOND, 0, "empty", vehicle) for vehicle in VEHICLES]
     return [cell for cell in found if any(fnmatch(cell.name, pattern) for pattern in only)]
 
 
@@ -130,7 +138,7 @@ def scenario_of(cell: Cell, seed: int, conditions: Conditions | None = None) -> 
         seed=seed,
         start_utc=datetime.datetime(2025, 6, 1, 10, 20, 30, tzinfo=datetime.UTC),
         duration_s=cell.duration_s,
-        scene=SceneSettings(kind=cell.scene),
+        scene=SceneSettings(kind=cell.scene, sky="varied" if conditions.varied_sky else "usual"),
         vehicle={"camera_height_m": CAMERA_HEIGHT_M, "path": vehicle},  # pyright: ignore[reportArgumentType]
         drone=drones[0] if drones else None,
         other_drones=drones[1:],
@@ -138,7 +146,10 @@ def scenario_of(cell: Cell, seed: int, conditions: Conditions | None = None) -> 
         script=SWEEPS if cell.motion in SEARCHING else SWEEP_THEN_FOLLOW,
         truth_visible=bool(drones),
         autopilot=AutopilotSettings() if conditions.autopilot and drones else None,
-        lidar=LidarSettings() if perturbed is None else LidarSettings(range_offset_m=perturbed.range_offset_m),
+        lidar=LidarSettings(
+            footprint="sparse" if conditions.sparse else "dense",
+            range_offset_m=0.0 if perturbed is None else perturbed.range_offset_m,
+        ),
         cameras=_cameras(conditions, bool(drones), perturbed),
         weather=RAIN if conditions.rain else Weather(),
         vehicle_odometry=VehicleOdometrySettings() if conditions.odometry else None,

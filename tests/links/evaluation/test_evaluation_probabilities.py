@@ -9,7 +9,7 @@ from flow.link import LinkError, Run
 from links.evaluation.groups import reliability, reliability_table
 from links.evaluation.run_data import read_run
 from links.runs.results import CANDIDATES_FILE, Results
-from stages.messages import Candidates
+from stages.messages import CandidateLog
 from tests.links.command import grd
 from tests.links.evaluation.made_runs import all_evaluated, lines, make_run, stamp, truth_at
 
@@ -96,35 +96,31 @@ def test_the_table_has_probabilities_and_shares_of_drones(tmp_path):
     assert "reliability of the detector's probabilities" in grd("evaluate", *folders, "--by", "config")
 
 
-def candidates(scan_passes, probability, life=7):
-    n = len(scan_passes)
-    return Candidates(
+def candidate_log(numbers, probability, life=7):
+    n = len(numbers)
+    return CandidateLog(
         stamp_ns=1_000_000_000,
-        candidate_id=np.arange(1, n + 1),
+        candidate_id=np.array(numbers),
+        seen_ns=np.full(n, 900_000_000),
         xyz_vehicle_m=np.arange(3.0 * n).reshape(n, 3),
-        velocity_vehicle_mps=np.zeros((n, 3)),
         probability=np.array(probability),
-        seen_ns=np.zeros(n, dtype=np.int64),
-        scan_passes=np.array(scan_passes),
-        reasons=("",) * n,
-        accept_probability=0.95,
+        features=np.column_stack([np.full(n, 12.5), np.full(n, np.nan)]),
+        feature_names=("range_m", "speed_mps"),
         detector_instance=life,
     )
 
 
-def test_a_run_writes_a_line_for_each_new_observation(tmp_path):
+def test_a_run_writes_a_line_for_each_classified_candidate(tmp_path):
     results = Results()
     results.open(Run(tmp_path, "made", "", ""))
-    assert results.wants(Candidates)
-    for message in (candidates([1, 4], [0.1, 0.9]), candidates([1, 5], [0.1, 0.95]), candidates([1], [0.1], life=8)):
-        results.see("detect.candidates", message, 0)
+    assert results.wants(CandidateLog)
+    for message in (candidate_log([1, 2], [0.1, 0.9]), candidate_log([1], [0.2], life=8)):
+        results.see("detect.candidate_log", message, 0)
     results.close()
     lines = (tmp_path / CANDIDATES_FILE).read_text().splitlines()
-    assert lines[0] + "\n" == HEAD
-    assert [line.split(",")[1:5] for line in lines[1:]] == [
-        ["1", "7", "1", "0.1"],
-        ["2", "7", "4", "0.9"],
-        ["2", "7", "5", "0.95"],
-        ["1", "8", "1", "0.1"],
+    assert lines == [
+        "stamp_s,candidate,detector_instance,probability,x_m,y_m,z_m,range_m,speed_mps",
+        "0.900000000,1,7,0.1,0.000,1.000,2.000,12.5,",
+        "0.900000000,2,7,0.9,3.000,4.000,5.000,12.5,",
+        "0.900000000,1,8,0.2,0.000,1.000,2.000,12.5,",
     ]
-    assert lines[2].split(",")[5:] == ["3.0000", "4.0000", "5.0000"]

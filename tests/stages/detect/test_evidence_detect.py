@@ -21,11 +21,13 @@ from stages.detect.candidate import Alternative, Observation
 from stages.detect.candidate_messages import detections_message, log_odds_of
 from stages.detect.classifier import ClassifierWeights, over_clutter
 from stages.detect.evidence_detect import HYSTERESIS_NATS, NEAR_REJECTED_M, NEAR_REJECTED_NS, STATIC_NS
+from stages.detect.trained.features import NAMES, VERSION
 from stages.geometry.frames import rotation_from_rpy_deg, rotation_z
 from stages.geometry.trajectory import VehicleTrajectory
 from stages.kernels.detect.isolation import FREE_0, SECTORS, TALLY
 from stages.messages import (
     CandidateEvidence,
+    CandidateLog,
     Candidates,
     Detections,
     DroneLocalPosition,
@@ -155,7 +157,7 @@ def reasons_of(candidates):
 
 def test_ports_are_what_the_graph_wires():
     assert set(input_ports(EvidenceDetect)) == {"motion", "pulses", "drone_position", "drone_odometry"}
-    assert set(output_ports(EvidenceDetect)) == {"candidates", "detections"}
+    assert set(output_ports(EvidenceDetect)) == {"candidate_log", "candidates", "detections"}
     assert EvidenceDetect.optional_inputs == {"motion", "drone_position", "drone_odometry"}
 
 
@@ -636,6 +638,34 @@ def test_the_same_pulses_give_the_same_messages():
     for a, b in zip(once[1], again[1], strict=True):
         np.testing.assert_array_equal(a.evidence.probability, b.evidence.probability)
         np.testing.assert_array_equal(a.xyz_vehicle_m, b.xyz_vehicle_m)
+
+
+def test_a_trained_model_replaces_the_classifier():
+    term = {"alternative": 3, "feature": "range_m", "knots": (0.0, 1.0), "values": (0.0, -4.0)}
+    model = {"feature_version": VERSION, "priors": [(9.0, 9.0)] * 4, "terms": [term]}
+    _, accepted = run([hovering()], 1.5, model=model)
+    assert accepted_after_s(accepted) < 1.0
+    candidates, refused = run([hovering()], 1.5, model=model | {"priors": [(9.0, 9.0)] * 3 + [(2.0, 9.0)]})
+    assert accepted_after_s(refused) == math.inf
+    assert candidates[-1].probability[0] == pytest.approx(1 / (1 + math.exp(2.0)), abs=0.01)
+    assert "(-4.0); if not a drone: a balloon" in candidates[-1].reasons[0]
+
+
+def test_every_classified_candidate_is_logged_with_its_features():
+    stage, logged = EvidenceDetect(sweep_deg=PASS_DEG), []
+    for pulses in pulses_seen([Drone(MOVING)], WATCHING, 1.5):
+        logged += [m for m in stage.on_pulses(pulses) if isinstance(m, CandidateLog)]
+    for message in logged:
+        check_arrays(message)
+        assert message.feature_names == NAMES
+    passes = np.array([m.features[0, NAMES.index("scan_passes")] for m in logged])
+    existence = np.array([m.features[0, NAMES.index("existence_nats")] for m in logged])
+    assert passes[0] == 1.0
+    assert passes[-1] > 8.0
+    assert existence[0] < 0.0 < 20.0 < existence[-1]
+    last = logged[-1]
+    truth = MOVING(np.array([(last.seen_ns[0] - START_NS) * 1e-9]))[0]
+    np.testing.assert_allclose(last.xyz_vehicle_m[0], truth, atol=0.3)
 
 
 def test_a_slice_without_pulses_is_ignored():

@@ -19,6 +19,8 @@ from links.simulated.world.procedural.open_scenes import campus, open_lot, park_
 from links.simulated.world.procedural.parts import car
 from links.simulated.world.procedural.settings import HALF_LENGTH_M, Kind, SceneSettings, VehicleCorridor
 from links.simulated.world.procedural.street import manhattan, street
+from links.simulated.world.procedural.village import village, village_movers
+from links.simulated.world.sky_movers import draw_sky
 from stages.geometry.frames import Array64, rotation_z
 
 KINDS: dict[Kind, Callable[[SceneSettings, VehicleCorridor, Generator], list[Mesh]]] = {
@@ -28,6 +30,7 @@ KINDS: dict[Kind, Callable[[SceneSettings, VehicleCorridor, Generator], list[Mes
     "campus": campus,
     "park_edge": park_edge,
     "open_lot": open_lot,
+    "village": village,
 }
 PARKED = np.zeros((1, 2))
 
@@ -69,6 +72,10 @@ def _movers(
         driver = Car(car(rng), ends[0], ends[1], rng.uniform(5, 14), rng.uniform(0, 60))
         if corridor.allows(np.arange(-HALF_LENGTH_M, HALF_LENGTH_M, 1.0), lane_y, 1.0):
             movers.append(driver)
+    if settings.kind == "village":
+        return (*movers, *village_movers(rng, birds + balloons))
+    if settings.sky == "varied":
+        return (*movers, *draw_sky(rng, birds + balloons))
     road = settings.road_width_m / 2
     for _ in range(birds):
         movers.append(draw_bird(rng, 3.0, 22.0, 28.0, road + 1.0, turn))

@@ -6,7 +6,7 @@ Source: ours.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,7 +19,7 @@ KERB_HEIGHT_M = 0.12
 VEHICLE_HALF_WIDTH_M = 1.0
 VEHICLE_HALF_LENGTH_M = 2.4
 
-Kind = Literal["street", "manhattan", "atlanta", "campus", "park_edge", "open_lot"]
+Kind = Literal["street", "manhattan", "atlanta", "campus", "park_edge", "open_lot", "village"]
 MOVERS: dict[str, tuple[int, int, int]] = {  # kind: moving cars, birds, balloons
     "street": (0, 0, 0),
     "manhattan": (3, 3, 1),
@@ -27,7 +27,12 @@ MOVERS: dict[str, tuple[int, int, int]] = {  # kind: moving cars, birds, balloon
     "campus": (1, 5, 1),
     "park_edge": (2, 7, 1),
     "open_lot": (1, 5, 1),
+    "village": (0, 4, 1),
 }
+
+
+def _is_usual(sky: str) -> bool:
+    return sky == "usual"  # scenario files leave out a setting that they do not use
 
 
 class SceneSettings(BaseModel):
@@ -46,6 +51,8 @@ class SceneSettings(BaseModel):
     driving_cars: int | None = Field(default=None, ge=0, le=20)  # null: default of the kind
     birds: int | None = Field(default=None, ge=0, le=50)
     balloons: int | None = Field(default=None, ge=0, le=10)
+    # varied: gliding, circling and hovering birds, flocks, insects, kites and bags in place of `birds` and `balloons`
+    sky: Annotated[Literal["usual", "varied"], Field(exclude_if=_is_usual)] = "usual"
     vehicle_lane_y_m: float = -1.9  # the vehicle's start position across the street
     vehicle_yaw_deg: float = 0.0
 

@@ -1,0 +1,1 @@
+"""Training of the detector's model from the candidate logs of runs (`grd train-detector`)."""

@@ -1,0 +1,114 @@
+"""Candidate logs of runs as training data: features, whether the candidate was a drone, and groups to split by.
+
+A row is one classification of one candidate. Successive rows of a candidate hardly differ: all of the first
+FIRST_ROWS are used, later ones ever more sparsely. A candidate is a drone when its last observation is within
+`false_m` of one in truth; rows at times without truth are left out.
+
+Source: grd.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from flow.link import LinkError
+from links.evaluation.association import EvaluationLimits, interpolate, read_true_drones
+from links.evaluation.text_files import Flags
+from links.runs import results
+from stages.detect.trained.features import NAMES
+from stages.geometry.frames import Array64
+
+FIRST_ROWS = 30
+SPARSER = 1.15  # beyond, the ratio of the numbers of two rows used
+SEED = re.compile(r"-s(\d+)(?:-.*)?$")
+REQUIRED = ("range_m", "existence_nats", "scan_passes", "free_sectors")  # always available
+
+
+@dataclass(frozen=True)
+class CandidateRows:
+    """Rows of the candidate logs of several runs."""
+
+    X: Array64  # (n, features), NaN: not available
+    is_drone: Flags  # (n,)
+    logged: Array64  # (n,) probability that the run itself gave
+    candidate: NDArray[np.int64]  # (n,) number over all runs
+    seed: NDArray[np.int64]  # (n,) of the recording
+    run: NDArray[np.int64]  # (n,) index of the run
+    stamp_ns: NDArray[np.int64]  # (n,)
+
+    def take(self, rows: Flags) -> CandidateRows:
+        """The selected rows."""
+        return CandidateRows(**{name: values[rows] for name, values in vars(self).items()})
+
+    def feature(self, name: str) -> Array64:
+        """One feature (n,)."""
+        return self.X[:, NAMES.index(name)]
+
+    @property
+    def with_telemetry(self) -> Flags:
+        """Rows that were compared with the drone's telemetry."""
+        return ~np.isnan(self.feature("over_static_nats"))
+
+
+def read_candidates(runs: Sequence[Path], thin: bool = True) -> CandidateRows:
+    """The rows of all runs. LinkError for a run without truth, with other features, or without a required one."""
+    parts = [_read(folder, index, thin) for index, folder in enumerate(runs)]
+    frame = pd.concat([part for part in parts if len(part)])
+    if frame.empty:
+        raise LinkError("no run has candidates")
+    return CandidateRows(
+        X=frame[list(NAMES)].to_numpy(dtype=np.float64),
+        is_drone=frame.is_drone.to_numpy(dtype=np.bool_),
+        logged=frame.probability.to_numpy(dtype=np.float64),
+        candidate=frame.groupby(["run", "detector_instance", "candidate"]).ngroup().to_numpy(dtype=np.int64),
+        seed=frame.seed.to_numpy(dtype=np.int64),
+        run=frame.run.to_numpy(dtype=np.int64),
+        stamp_ns=frame.stamp_ns.to_numpy(dtype=np.int64),
+    )
+
+
+def _read(folder: Path, index: int, thin: bool) -> pd.DataFrame:
+    file = folder / results.CANDIDATES_FILE
+    if not file.exists():
+        if (folder / results.SUMMARY_FILE).exists():
+            return pd.DataFrame()  # nothing was ever a candidate
+        raise LinkError(f"{folder}: not the folder of a complete run")
+    frame = pd.read_csv(file, dtype={"stamp_s": str})
+    if absent := [name for name in NAMES if name not in frame.columns]:
+        raise LinkError(f"{file}: no feature {', '.join(absent)}; replay the recording with this version of grd")
+    for name in REQUIRED:
+        missing = np.isnan(frame[name].to_numpy(dtype=np.float64))
+        if missing.any():
+            raise LinkError(f"{file}:{int(missing.argmax()) + 2}: {name} is missing")
+    frame["stamp_ns"] = [int(s) * 10**9 + int(f.ljust(9, "0")) for s, f in (t.split(".") for t in frame.stamp_s)]
+    known, frame["is_drone"] = _labels(folder, frame)
+    seed = SEED.search(folder.name)
+    frame = frame.assign(run=index, seed=int(seed[1]) if seed else 0).loc[known]
+    if thin:
+        number = frame.groupby(["detector_instance", "candidate"]).cumcount().to_numpy()
+        step = np.floor(np.log(np.maximum(number, FIRST_ROWS) / FIRST_ROWS) / np.log(SPARSER))
+        before = np.floor(np.log(np.maximum(number - 1, FIRST_ROWS) / FIRST_ROWS) / np.log(SPARSER))
+        frame = frame.loc[(number < FIRST_ROWS) | (step != before)]
+    return frame
+
+
+def _labels(folder: Path, frame: pd.DataFrame) -> tuple[Flags, Flags]:
+    """Rows with truth, and those within `false_m` of a drone."""
+    limits, (drones, empty_sky) = EvaluationLimits(), read_true_drones(folder, None)
+    known = np.full(len(frame), empty_sky)
+    is_drone = np.zeros(len(frame), dtype=np.bool_)
+    if not empty_sky and drones[0].path is None:
+        raise LinkError(f"{folder}: {next(iter(drones[0].missing.values()))}: nothing to train on")
+    for path in [] if empty_sky else [drone.path for drone in drones if drone.path is not None]:
+        covered, at_m = interpolate(frame.stamp_ns.to_numpy(), path.stamps_ns, path.xyz_m, limits.max_gap_ns)
+        known |= covered
+        distance = np.linalg.norm(frame[["x_m", "y_m", "z_m"]].to_numpy() - at_m, axis=1)
+        is_drone |= covered & (distance < limits.false_m)
+    return known, is_drone

@@ -1,0 +1,265 @@
+"""Fits the detector's model to candidate rows and scores it on others.
+
+Penalised maximum likelihood over the values at the knots, which are quantiles of the training data. The penalty pulls
+to the prior knowledge: log likelihood ratios of the telemetry count as they are, in part, since their observations err
+together; everything else counts nothing until the data show it. Its strength is chosen by the log loss on seeds that
+were left out, since the rows of one flight are not independent.
+
+Source: grd; Wood, Generalized Additive Models (2017), 5.3 (penalised linear splines); SciPy's L-BFGS-B.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from flow.link import LinkError
+from links.training.candidates import CandidateRows
+from stages.detect.trained.features import FEATURES, NAMES, RANGE, TELEMETRY, VERSION
+from stages.detect.trained.model import ALTERNATIVES, ANY, FAR, NEAR, DetectorModel, Term, farness
+from stages.geometry.frames import Array64
+
+KNOTS = 6
+LEAST_KNOWN = 50  # rows that have a feature, to use it
+LLR_KNOTS = (-12.0, -6.0, -3.0, 0.0, 3.0, 6.0, 12.0)  # [nats] of features that are log likelihood ratios
+LLR_SHARE = {"displaced_nats": 0.8, "over_bird_nats": 0.9, "over_balloon_nats": 0.9, "return_count_nats": 0.5}
+PRIOR_PENALTY = 0.02  # of the priors, relative to the other parameters
+STRENGTHS = (0.3, 1.0, 3.0)
+FOLDS = 3
+EASY_SHARE = 0.05  # of the single observations without telemetry that are used; they are most of all rows
+RANGES_M = (0.0, 15.0, 25.0, 35.0, 70.0)  # bands of the scores
+USED: tuple[tuple[str, ...], ...] = (  # features of each alternative
+    (
+        "existence_nats", "false_per_s", "range_m", "scan_passes", "age_s", "first_returns", "return_ratio",
+        "return_count_nats", "passed_pulses", "missed_returns", "neighbour_score",
+    ),
+    (
+        "range_m", "scan_passes", "return_count_nats", "free_sectors", "least_free", "neighbour_score",
+        "isolated_score", "large_object_m", "large_object_share", "extent_ratio", "largest_extent_ratio",
+        "too_long_passes", "scatter_m", "displacement_m", "straight_mps", "straight_sigmas", "moves", "near_rejected",
+        "revisited", "displaced_nats", "misfit", "passes_since_reacquired",
+    ),
+    (
+        "range_m", "age_s", "return_ratio", "extent_ratio", "top_mps", "relative_speed_mps", "acceleration_mps2",
+        "fastest_mps", "hardest_mps2", "calm_s", "steady_s", "scatter_m", "straight_sigmas", "climb_mps",
+        "over_bird_nats", "misfit",
+    ),
+    ("range_m", "round_chords", "rough_chords", "straight_mps", "over_balloon_nats"),
+)  # fmt: skip
+RANGED = {  # features whose weight depends on the range: their terms are near and far
+    "scan_passes", "first_returns", "return_ratio", "free_sectors", "neighbour_score", "isolated_score",
+    "displaced_nats", "extent_ratio",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Score:
+    """Scores of probabilities in a range band, with telemetry or without."""
+
+    band: str
+    rows: int
+    drones: int
+    brier: float
+    log_loss: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Column:
+    """One parameter: a ramp from `low` to `high` of a feature, its missing flag (low NaN), or a prior (no feature)."""
+
+    alternative: int
+    feature: str
+    at: str  # any, near or far
+    low: float
+    high: float
+    sign: int
+    mean: float  # to which the penalty pulls it
+
+
+def train(rows: CandidateRows, trained: dict[str, Any], left_out: Sequence[str] = ()) -> DetectorModel:
+    """The model of these rows. `left_out`: features that it does not use (ablation)."""
+    seeds = np.unique(rows.seed)
+    if min(rows.is_drone.sum(), (~rows.is_drone).sum()) < 100 or len(seeds) < 2:
+        raise LinkError("training needs at least 100 rows of drones, 100 of others, and two seeds")
+    easy = ~rows.is_drone & ~rows.with_telemetry & (rows.feature("scan_passes") <= 1)
+    kept = ~easy | (np.random.default_rng(0).uniform(size=len(easy)) < EASY_SHARE)
+    weight = np.where(easy, 1.0 / EASY_SHARE, 1.0)[kept]
+    columns = _columns(rows.take(kept), left_out)
+    A, y = _design(rows.X[kept], columns), rows.is_drone[kept]
+    fold = np.searchsorted(seeds, rows.seed[kept]) % min(FOLDS, len(seeds))
+    losses = {strength: _left_out_loss(A, y, weight, fold, columns, strength) for strength in STRENGTHS}
+    strength = min(losses, key=lambda s: losses[s])
+    theta = _fitted(A, y, weight, columns, strength)
+    trained["strength"], trained["left_out_log_loss"] = strength, {s: round(v, 5) for s, v in losses.items()}
+    return _model(columns, theta, trained)
+
+
+def predicted(model: DetectorModel, rows: CandidateRows) -> Array64:
+    """Probabilities (n,) by the model."""
+    return 1.0 / (1.0 + np.exp(-np.array([model.answer(x).log_odds for x in rows.X])))
+
+
+def scores(rows: CandidateRows, probability: Array64) -> list[Score]:
+    """Brier score and log loss [nats] by range band, with and without telemetry."""
+    p = np.clip(probability, 1e-6, 1 - 1e-6)
+    brier, loss = (p - rows.is_drone) ** 2, -np.log(np.where(rows.is_drone, p, 1 - p))
+    found: list[Score] = []
+    for telemetry in (True, False):
+        for low, high in pairwise(RANGES_M):
+            here = (rows.with_telemetry == telemetry) & (rows.feature("range_m") >= low)
+            here &= rows.feature("range_m") < high
+            if here.any():
+                name = f"{low:.0f} to {high:.0f} m, {'with' if telemetry else 'without'} telemetry"
+                drones = int(rows.is_drone[here].sum())
+                found.append(Score(name, int(here.sum()), drones, float(brier[here].mean()), float(loss[here].mean())))
+    return found
+
+
+def _columns(rows: CandidateRows, left_out: Sequence[str]) -> list[_Column]:
+    """The parameters, with knots at quantiles of the drones and three times as many other rows."""
+    rng, others = np.random.default_rng(0), np.nonzero(~rows.is_drone)[0]
+    drones = np.nonzero(rows.is_drone)[0]
+    some = np.concatenate([drones, rng.choice(others, min(3 * len(drones), len(others)), replace=False)])
+    columns: list[_Column] = []
+    for alternative, names in enumerate(USED):
+        columns += [_Column(alternative, "", ANY, told, told, 0, 2.0 * told) for told in (0.0, 1.0)]
+        for name in names:
+            if name in left_out:
+                continue
+            x, share = rows.feature(name)[some], LLR_SHARE.get(name, 0.0)
+            known = x[~np.isnan(x)]
+            if len(known) < LEAST_KNOWN:
+                continue
+            is_llr = name in LLR_SHARE or name == "flight_nats"
+            knots = np.array(LLR_KNOTS) if is_llr else np.unique(_rounded(np.quantile(known, _levels())))
+            sign = FEATURES[NAMES.index(name)].monotone
+            for at in (NEAR, FAR) if name in RANGED else (ANY,):
+                ramps = pairwise(knots.tolist())
+                columns += [_Column(alternative, name, at, a, b, sign, share * (b - a)) for a, b in ramps]
+                if not name.endswith("_nats") and name != "misfit":
+                    columns.append(_Column(alternative, name, at, np.nan, np.nan, 0, 0.0))
+    return columns
+
+
+def _levels() -> Array64:
+    return np.linspace(0.02, 0.98, KNOTS)
+
+
+def _rounded(values: Array64) -> Array64:
+    return np.array([float(f"{value:.4g}") for value in values])
+
+
+def _design(X: Array64, columns: Sequence[_Column]) -> list[NDArray[np.float32]]:
+    """The design matrix (n, parameters) of each alternative. Ramps of ratios below 0 are -1 to 0: 0 is no evidence."""
+    told, far = ~np.isnan(X[:, TELEMETRY]), farness(X[:, RANGE])
+    shares = {ANY: np.ones(len(X)), NEAR: 1.0 - far, FAR: far}
+    found: list[NDArray[np.float32]] = []
+    for alternative in range(len(ALTERNATIVES)):
+        parts: list[Array64] = []
+        for c in columns:
+            if c.alternative != alternative:
+                continue
+            if not c.feature:
+                parts.append((told == (c.low == 1.0)).astype(np.float64))
+                continue
+            x = X[:, NAMES.index(c.feature)]
+            missing = np.isnan(x)
+            if np.isnan(c.low):
+                parts.append(missing * shares[c.at])
+            else:
+                ramp = np.clip((np.where(missing, 0.0, x) - c.low) / (c.high - c.low), 0.0, 1.0) - _start(c)
+                parts.append(np.where(missing, 0.0, ramp) * shares[c.at])
+        found.append(np.column_stack(parts).astype(np.float32))
+    return found
+
+
+def _start(c: _Column) -> float:
+    """Value of a ramp that counts as no evidence."""
+    return 1.0 if c.feature.endswith("_nats") and c.high <= 0.0 else 0.0
+
+
+def _over(A: list[NDArray[np.float32]], theta: Array64) -> Array64:
+    """Log-odds (n, alternatives) of a drone over each alternative."""
+    parts = np.split(theta.astype(np.float32), np.cumsum([a.shape[1] for a in A])[:-1])
+    return np.column_stack([a @ part for a, part in zip(A, parts, strict=True)]).astype(np.float64)
+
+
+def _total(over: Array64) -> tuple[Array64, Array64]:
+    """Log-odds (n,) of a drone, and the probability (n, alternatives) of each alternative among them."""
+    least = over.min(axis=1, keepdims=True)
+    weight = np.exp(least - over)
+    return least[:, 0] - np.log(weight.sum(axis=1)), weight / weight.sum(axis=1, keepdims=True)
+
+
+def _loss(log_odds: Array64, y: NDArray[np.bool_]) -> Array64:
+    return np.logaddexp(0.0, np.where(y, -log_odds, log_odds))
+
+
+def _fitted(
+    A: list[NDArray[np.float32]], y: NDArray[np.bool_], weight: Array64, columns: Sequence[_Column], strength: float
+) -> Array64:
+    mean = np.array([c.mean for c in columns])
+    penalty = strength * np.array([1.0 if c.feature else PRIOR_PENALTY for c in columns])
+
+    def objective(theta: Array64) -> tuple[float, Array64]:
+        log_odds, share = _total(_over(A, theta))
+        error = ((1.0 / (1.0 + np.exp(-log_odds)) - y) * weight)[:, None] * share
+        slope = np.concatenate([a.T @ error[:, k].astype(np.float32) for k, a in enumerate(A)]).astype(np.float64)
+        off = theta - mean
+        return float(_loss(log_odds, y) @ weight + 0.5 * (penalty * off) @ off), slope + penalty * off
+
+    bounds = [(0.0, None) if c.sign > 0 else (None, 0.0) if c.sign < 0 else (None, None) for c in columns]
+    return minimize(objective, mean, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 400}).x
+
+
+def _left_out_loss(
+    A: list[NDArray[np.float32]],
+    y: NDArray[np.bool_],
+    weight: Array64,
+    fold: NDArray[np.int64],
+    columns: Sequence[_Column],
+    strength: float,
+) -> float:
+    """Log loss over folds of seeds, each by a fit to the others."""
+    total = 0.0
+    for k in np.unique(fold):
+        own, other = fold != k, fold == k
+        theta = _fitted([a[own] for a in A], y[own], weight[own], columns, strength)
+        total += float(_loss(_total(_over([a[other] for a in A], theta))[0], y[other]) @ weight[other])
+    return total / float(weight.sum())
+
+
+def _model(columns: Sequence[_Column], theta: Array64, trained: dict[str, Any]) -> DetectorModel:
+    priors = np.zeros((len(ALTERNATIVES), 2))
+    ramps: dict[tuple[int, str, str], list[tuple[_Column, float]]] = {}
+    missing: dict[tuple[int, str, str], float] = {}
+    for c, value in zip(columns, theta.tolist(), strict=True):
+        if not c.feature:
+            priors[c.alternative, int(c.low)] = value
+        elif np.isnan(c.low):
+            missing[c.alternative, c.feature, c.at] = value
+        else:
+            ramps.setdefault((c.alternative, c.feature, c.at), []).append((c, value))
+    terms: list[Term] = []
+    for (alternative, feature, at), parts in ramps.items():
+        values = np.cumsum([0.0, *(value for _, value in parts)]) - sum(_start(c) * value for c, value in parts)
+        if np.abs(values).max() < 5e-4 and abs(missing.get((alternative, feature, at), 0.0)) < 5e-4:
+            continue
+        terms.append(
+            Term(
+                alternative=alternative,
+                feature=feature,
+                at=at,
+                knots=(parts[0][0].low, *(c.high for c, _ in parts)),
+                values=tuple(round(value, 4) for value in values.tolist()),
+                missing=round(missing.get((alternative, feature, at), 0.0), 4),
+            )
+        )
+    rounded = tuple((round(without, 4), round(with_, 4)) for without, with_ in priors.tolist())
+    return DetectorModel(feature_version=VERSION, priors=rounded, terms=tuple(terms), trained=trained)

@@ -1,0 +1,89 @@
+"""Bernoulli existence of one object behind a candidate's observations, recursively from the first return.
+
+In log-odds L, with kappa [1/m^3] the density of false observations per scan pass at that range:
+
+    birth           L = ln(births / kappa),  births: objects that appear in a scan pass, per m^3
+    survival        P(exists) *= exp(-dt / LIFETIME_S)
+    observation     L += ln(p_D N(innovation; S) / kappa)
+    pass-throughs   L += ln(1 - p_D),  p_D = 1 - (1 - q)^pulses,  q: a pulse through the middle of a drone returns
+
+kappa is measured: candidates that were observed once only, by range, in the last seconds (`FalseReturns`). It is high
+in rain and near trees.
+
+Source: Ristic, Vo, Vo, Farina, "A tutorial on Bernoulli filters", IEEE TSP 61 (2013), Equations 22 to 28; ours.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+SHELL_M = 4.0  # of the range histogram of false returns
+SHELLS = 32
+MEMORY_S = 6.0  # false returns count for this long (1 / e)
+PASS_S = 0.1  # between scan passes
+LIFETIME_S = 30.0  # assumed mean time that an object stays in view
+BIRTHS_PER_S = 0.02  # assumed: one object appears in the sky in 50 s
+LEAST_FALSE_PER_S = 0.05  # false returns of a clear sky, per shell: the prior of the histogram
+RETURNS_AT_MIDDLE = 0.6  # of the pulses through the middle of a drone: gaps pass the rest, as in track/hull.py
+RETURNS_TO_M = 35.0  # a dark drone returns them to this range, fewer by the inverse square beyond
+
+
+class FalseReturns:
+    """Rate of objects that were observed once only, by range: false returns, rain drops, leaves."""
+
+    def __init__(self) -> None:
+        self._count, self._stamp_ns = np.zeros(SHELLS), 0
+
+    def add(self, range_m: float, stamp_ns: int) -> None:
+        """Count one."""
+        self._fade(stamp_ns)
+        self._count[_shell(range_m)] += 1.0
+
+    def per_s(self, range_m: float, stamp_ns: int) -> float:
+        """Rate [1/s] in the shell at this range, at least LEAST_FALSE_PER_S."""
+        fading = math.exp(-max(stamp_ns - self._stamp_ns, 0) * 1e-9 / MEMORY_S)
+        return LEAST_FALSE_PER_S + float(self._count[_shell(range_m)]) * fading / MEMORY_S
+
+    def _fade(self, stamp_ns: int) -> None:
+        if stamp_ns > self._stamp_ns:
+            self._count *= math.exp(-(stamp_ns - self._stamp_ns) * 1e-9 / MEMORY_S)
+            self._stamp_ns = stamp_ns
+
+
+def _shell(range_m: float) -> int:
+    return min(int(range_m / SHELL_M), SHELLS - 1)
+
+
+def birth_nats(false_per_s: float) -> float:
+    """Log-odds after the first observation; the volume cancels."""
+    return math.log(BIRTHS_PER_S / SHELLS / false_per_s)
+
+
+def survived_nats(nats: float, dt_s: float) -> float:
+    """Log-odds after dt_s without information."""
+    exists = 1.0 / (1.0 + math.exp(-max(min(nats, 30.0), -30.0))) * math.exp(-dt_s / LIFETIME_S)
+    return math.log(exists / (1.0 - exists))
+
+
+def observed_nats(distance2_m2: float, variance_m2: float, range_m: float, pulses: int, false_per_s: float) -> float:
+    """Log ratio of an observation at this squared distance from a prediction with this variance on each axis."""
+    volume_m3 = 2.0 * math.pi * range_m**2 * SHELL_M
+    expected = false_per_s * PASS_S / volume_m3
+    density = math.exp(-0.5 * distance2_m2 / variance_m2) / (2.0 * math.pi * variance_m2) ** 1.5
+    return math.log(max(detection_probability(range_m, max(pulses, 1)) * density, 1e-12) / expected)
+
+
+def passed_nats(range_m: float, pulses: float) -> float:
+    """Log ratio of a scan pass whose pulses through the middle all passed."""
+    return pulses * math.log(1.0 - _returned(range_m))
+
+
+def detection_probability(range_m: float, pulses: float) -> float:
+    """Probability that one of `pulses` through the middle of a drone returns."""
+    return 1.0 - (1.0 - _returned(range_m)) ** pulses
+
+
+def _returned(range_m: float) -> float:
+    return RETURNS_AT_MIDDLE * min(1.0, (RETURNS_TO_M / range_m) ** 2)

@@ -1,0 +1,136 @@
+"""The trained model: log-odds that a candidate is a drone, against four alternatives.
+
+    log_odds = -ln sum_k exp(-o_k),    o_k = prior_k + sum_j g_kj(x_j)
+
+o_k are the log-odds of a drone over alternative k: a false return, a static object, a bird, a balloon. Each g_kj is a
+piecewise linear function of one feature, given by its values at knots, constant beyond the first and the last one, and
+monotone where `features.py` says so. A missing feature (NaN) adds `missing`. A term `at` near or far counts by its
+share of the range: near to NEAR_M, far from FAR_M, linear between, since a wire or an insect returns pulses near the
+sensor only. A drone must be more probable than every alternative, so the evidence against one of them never replaces
+that against another.
+
+`grd train-detector` writes the file (links/training); its command, data and scores are in it.
+
+Source: ours; Hastie, Tibshirani, "Generalized Additive Models", Stat. Sci. 1 (1986), in a multinomial of alternatives.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cached_property
+from itertools import pairwise
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from stages.detect.candidate import Alternative, Candidate
+from stages.detect.trained.features import FEATURES, NAMES, RANGE, TELEMETRY, VERSION
+from stages.geometry.frames import Array64
+from stages.kernels.detect.model import evaluate
+
+ALTERNATIVES = tuple(Alternative)
+NEAR_M, FAR_M = 12.0, 30.0  # of terms near and far
+ANY, NEAR, FAR = "any", "near", "far"
+REASONS = 3  # contributions named for people
+LEAST_NATS = 0.1  # contributions below are not named
+
+
+def farness(range_m: Any) -> Any:
+    """Share of the terms far, 0 to 1; 1 less it is that of the terms near."""
+    return np.clip((range_m - NEAR_M) / (FAR_M - NEAR_M), 0.0, 1.0)
+
+
+class Answer(NamedTuple):
+    """What the model says of a candidate."""
+
+    log_odds: float  # of a drone
+    alternative: int  # the most probable one, an index of ALTERNATIVES
+    contributions: Array64  # (features,) of each feature to log_odds [nats]
+
+
+class Term(BaseModel):
+    """g_kj of one alternative and one feature."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    alternative: int = Field(ge=0, lt=len(ALTERNATIVES))
+    feature: str
+    at: Literal["any", "near", "far"] = "any"
+    knots: tuple[float, ...] = Field(min_length=2)
+    values: tuple[float, ...] = Field(min_length=2)  # [nats] at the knots
+    missing: float = 0.0
+
+    @model_validator(mode="after")
+    def _is_a_function(self) -> Term:
+        if self.feature not in NAMES:
+            raise ValueError(f"there is no feature '{self.feature}'")
+        if len(self.knots) != len(self.values) or any(b <= a for a, b in pairwise(self.knots)):
+            raise ValueError(f"{self.feature}: knots must rise and have one value each")
+        return self
+
+
+class DetectorModel(BaseModel):
+    """The weights file."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    feature_version: int
+    priors: tuple[tuple[float, float], ...]  # of each alternative, without and with telemetry [nats]
+    terms: tuple[Term, ...] = Field(min_length=1)
+    trained: dict[str, Any] = {}  # command, data, versions, held-out scores: for people
+
+    @model_validator(mode="after")
+    def _fits_these_features(self) -> DetectorModel:
+        if self.feature_version != VERSION:
+            raise ValueError(
+                f"the model has feature version {self.feature_version}, this grd has {VERSION}: "
+                "train it again with `grd train-detector`"
+            )
+        if len(self.priors) != len(ALTERNATIVES):
+            raise ValueError(f"priors: there are {len(ALTERNATIVES)} alternatives")
+        return self
+
+    @cached_property
+    def _tables(self) -> tuple[NDArray[np.int64], Array64, Array64, Array64]:
+        """(alternative, feature, knots, `at`) (terms, 4); knots, values (terms, most); missing (terms,)."""
+        most = max(len(term.knots) for term in self.terms)
+        where = [
+            (t.alternative, NAMES.index(t.feature), len(t.knots), (ANY, NEAR, FAR).index(t.at)) for t in self.terms
+        ]
+        knots, values = (np.zeros((len(self.terms), most)) for _ in range(2))
+        for row, term in enumerate(self.terms):
+            knots[row, : len(term.knots)], values[row, : len(term.knots)] = term.knots, term.values
+        return np.array(where, dtype=np.int64), knots, values, np.array([term.missing for term in self.terms])
+
+    def answer(self, features: Array64) -> Answer:
+        """Log-odds of a drone for features (len(FEATURES),)."""
+        compared = not math.isnan(features[TELEMETRY])
+        over = np.array([prior[compared] for prior in self.priors])
+        contributions = np.zeros((len(ALTERNATIVES), len(NAMES)))
+        log_odds = evaluate(*self._tables, features, farness(features[RANGE]), over, contributions)
+        return Answer(log_odds, int(np.argmin(over)), contributions[0])
+
+    def classify(self, c: Candidate) -> tuple[float, str]:
+        """Log-odds that the candidate is a drone by its `features`, and the reasons; see `classifier.classify`.
+
+        Sets `c.alternative` and `c.rejection`.
+        """
+        answer = self.answer(c.features)
+        c.alternative = ALTERNATIVES[answer.alternative]
+        c.rejection = c.alternative.value
+        return answer.log_odds, reasons_of(c.features, answer)
+
+
+def reasons_of(features: Array64, answer: Answer) -> str:
+    """The largest contributions as text, with the values of their features, and what it is if not a drone."""
+    order: list[int] = np.argsort(-np.abs(answer.contributions), kind="stable")[:REASONS].tolist()
+    nats = {k: float(answer.contributions[k]) for k in order if abs(answer.contributions[k]) >= LEAST_NATS}
+    reasons = [_reason(FEATURES[k].text, float(features[k]), value) for k, value in nats.items()]
+    return "; ".join([*reasons, f"if not a drone: {ALTERNATIVES[answer.alternative].value}"])
+
+
+def _reason(text: str, value: float, nats: float) -> str:
+    known = "not known" if math.isnan(value) else f"{value:.3g}"
+    return f"{text}: {known} ({nats:+.1f})"

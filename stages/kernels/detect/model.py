@@ -1,0 +1,61 @@
+"""Compiled evaluation of the detector's model.
+
+Source: see `stages/detect/trained/model.py`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.geometry.frames import Array64
+from stages.kernels.compiled import compiled
+
+
+@compiled
+def evaluate(
+    where: NDArray[np.int64],
+    knots: Array64,
+    values: Array64,
+    missing: Array64,
+    x: Array64,
+    far: float,
+    over: Array64,
+    contributions: Array64,
+) -> float:
+    """Log-odds of a drone for features x (n,); see `DetectorModel` for where, knots, values, missing.
+
+    far: `farness` of its range. Adds the terms to over (alternatives,), which holds the priors. Row 0 of contributions
+    (alternatives, n) becomes the contribution of each feature: its terms, each weighted by the probability of its
+    alternative among them.
+    """
+    for row in range(where.shape[0]):
+        alternative, feature, last = where[row, 0], where[row, 1], where[row, 2] - 1
+        value = x[feature]
+        if math.isnan(value):
+            nats = missing[row]
+        elif value <= knots[row, 0]:
+            nats = values[row, 0]
+        elif value >= knots[row, last]:
+            nats = values[row, last]
+        else:
+            k = 1
+            while value > knots[row, k]:
+                k += 1
+            share = (value - knots[row, k - 1]) / (knots[row, k] - knots[row, k - 1])
+            nats = values[row, k - 1] + share * (values[row, k] - values[row, k - 1])
+        if where[row, 3] > 0:
+            nats *= far if where[row, 3] == 2 else 1.0 - far
+        over[alternative] += nats
+        contributions[alternative, feature] += nats
+    least = over.min()
+    weight = np.exp(least - over)
+    total = weight.sum()
+    for feature in range(x.size):
+        weighted = 0.0
+        for alternative in range(over.size):
+            weighted += contributions[alternative, feature] * weight[alternative] / total
+        contributions[0, feature] = weighted
+    return least - math.log(total)

@@ -1,0 +1,133 @@
+"""`grd train-detector`: rows from runs, labels by truth, a reproducible file, scores on held-out runs, wrong input."""
+
+from __future__ import annotations
+
+import csv
+import math
+
+import numpy as np
+import pytest
+import yaml
+from typer.testing import CliRunner
+
+from flow.link import LinkError
+from links.cli.app import app
+from links.evaluation.text_files import NO_DRONE
+from links.runs import results
+from links.training.candidates import FIRST_ROWS, read_candidates
+from links.training.fit import scores, train
+from stages.detect.trained.features import FEATURES, NAMES
+from stages.detect.trained.model import DetectorModel
+
+DRONE_M = np.array([5.0, 8.0, 10.0])
+
+
+def write_run(folder, seed, candidates=60, rows=6, drop=()):
+    """A run in which drones, at DRONE_M, differ from others by speed, and by telemetry where there is some."""
+    rng = np.random.default_rng(seed)
+    folder.mkdir(parents=True)
+    (folder / results.SUMMARY_FILE).write_text("{}")
+    header = "# T_vehicle_drone, position only, truth\n"
+    lines = header + "".join(f"{t:.2f} 5 8 10 0 0 0 1\n" for t in np.arange(0.0, 30.0, 0.1))
+    (folder / results.TRUTH_FILE).write_text(lines)
+    names = [name for name in NAMES if name not in drop]
+    with (folder / results.CANDIDATES_FILE).open("w", newline="") as stream:
+        writer = csv.writer(stream)
+        writer.writerow(["stamp_s", "candidate", "detector_instance", "probability", "x_m", "y_m", "z_m", *names])
+        for number in range(candidates):
+            drone = number % 3 == 0
+            for k in range(rows):
+                values = dict.fromkeys(NAMES, 0.0) | {
+                    "range_m": rng.uniform(5, 40),
+                    "top_mps": rng.normal(2.0 if drone else 6.0, 1.0),
+                    "over_static_nats": 1.0 if number % 2 else math.nan,
+                    "displaced_nats": rng.normal(4.0 if drone else -4.0) if number % 2 else math.nan,
+                }
+                at = DRONE_M + (rng.normal(0, 0.1, 3) if drone else rng.uniform(3, 9, 3))
+                cells = ["" if math.isnan(values[name]) else f"{values[name]:.5g}" for name in names]
+                writer.writerow([f"{1.0 + 0.1 * k:.9f}", number, 7, 0.5, *(f"{v:.3f}" for v in at), *cells])
+    return folder
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs")
+    return [write_run(folder / f"park-20m-hover-parked-s{seed}-detector", seed) for seed in (1, 2, 3)]
+
+
+def test_a_candidate_at_the_drone_is_a_drone_and_the_name_has_the_seed(runs):
+    rows = read_candidates(runs)
+    assert rows.is_drone.sum() == 3 * 20 * 6
+    assert np.unique(rows.seed).tolist() == [1, 2, 3]
+    assert len(np.unique(rows.candidate)) == 180
+    assert rows.with_telemetry.mean() == 0.5
+    assert rows.logged.tolist() == [0.5] * len(rows.X)
+
+
+def test_later_rows_of_a_candidate_are_used_more_sparsely(tmp_path):
+    run = write_run(tmp_path / "x-s1-y", 1, candidates=3, rows=200)
+    thin, every = read_candidates([run]), read_candidates([run], thin=False)
+    assert len(every.X) == 600
+    assert 3 * FIRST_ROWS < len(thin.X) < 3 * (FIRST_ROWS + 20)
+
+
+def test_a_run_without_a_drone_has_no_drones(tmp_path, runs):
+    empty = write_run(tmp_path / "sky-s9-y", 9)
+    (empty / results.TRUTH_FILE).write_text(f"# {NO_DRONE} in this recording\n")
+    assert not read_candidates([empty]).is_drone.any()
+
+
+def test_the_model_separates_what_differs_and_is_calibrated_by_other_seeds(runs):
+    rows = read_candidates(runs)
+    model = train(rows, {})
+    p = np.array([1 / (1 + math.exp(-model.answer(x).log_odds)) for x in rows.X])
+    assert p[rows.is_drone].mean() > 0.85 > 0.2 > p[~rows.is_drone].mean()
+    assert p.mean() == pytest.approx(rows.is_drone.mean(), abs=0.03)
+    assert all(score.brier < 0.12 for score in scores(rows, p))
+
+
+def test_the_scores_are_those_of_the_formula(runs):
+    rows = read_candidates(runs)
+    for score in scores(rows, np.full(len(rows.X), 0.25)):
+        share = score.drones / score.rows
+        assert score.brier == pytest.approx(share * 0.75**2 + (1 - share) * 0.25**2)
+        assert score.log_loss == pytest.approx(-share * math.log(0.25) - (1 - share) * math.log(0.75))
+
+
+def test_a_feature_left_out_is_not_used(runs):
+    model = train(read_candidates(runs), {}, ["top_mps"])
+    x = np.zeros(len(NAMES))
+    faster = np.where([f.name == "top_mps" for f in FEATURES], 50.0, x)
+    assert model.answer(x).log_odds == model.answer(faster).log_odds
+
+
+def test_the_command_writes_a_file_that_the_configuration_takes_and_that_is_reproduced(runs, tmp_path):
+    files = [tmp_path / "one.yaml", tmp_path / "two.yaml"]
+    for file in files:
+        arguments = ["train-detector", *map(str, runs[:2]), "-o", str(file), "--held-out", str(tmp_path / "held")]
+        if not (tmp_path / "held").exists():
+            write_run(tmp_path / "held" / "village-20m-hover-parked-s8-detector", 8)
+        result = CliRunner().invoke(app, arguments)
+        assert result.exit_code == 0, result.output
+    assert "with telemetry" in result.output
+    model = yaml.safe_load(files[0].read_text())["stages"]["detect"]["config"]["model"]
+    assert model == yaml.safe_load(files[1].read_text())["stages"]["detect"]["config"]["model"]
+    trained = DetectorModel.model_validate(model).trained
+    assert trained["seeds"] == [1, 2]
+    assert trained["held_out"][0]["log_loss"] < trained["held_out"][0]["logged_log_loss"]
+
+
+def test_runs_that_cannot_be_used_are_named(tmp_path, runs):
+    with pytest.raises(LinkError, match="not the folder of a complete run"):
+        read_candidates([tmp_path])
+    with pytest.raises(LinkError, match="no feature scatter_m"):
+        read_candidates([write_run(tmp_path / "old-s1-x", 1, drop=("scatter_m",))])
+    with pytest.raises(LinkError, match="two seeds"):
+        train(read_candidates(runs[:1]), {})
+    broken = write_run(tmp_path / "broken-s1-x", 1)
+    text = (broken / results.CANDIDATES_FILE).read_text().splitlines()
+    cells = text[4].split(",")
+    cells[7] = ""
+    (broken / results.CANDIDATES_FILE).write_text("\n".join([*text[:4], ",".join(cells), *text[5:]]) + "\n")
+    with pytest.raises(LinkError, match=r"candidates.csv:5: range_m is missing"):
+        read_candidates([broken])

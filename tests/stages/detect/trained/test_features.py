@@ -1,0 +1,106 @@
+"""Features of candidates: values by hand, what is missing, symmetries."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from stages.detect.motion_log_ratios import MotionLogRatios
+from stages.detect.flight import lamp_sway_m
+from stages.detect.trained.features import FEATURES, NAMES, NOT_DISPLACED_NATS, PULSE_RAD, features_of
+from stages.geometry.frames import rotation_z
+from stages.kernels.detect.isolation import FREE_0, SECTORS
+from tests.stages.detect.test_candidate import PLACE_M, candidate, observation, path
+
+TELEMETRY = tuple(NAMES[NAMES.index("over_static_nats") :])
+MOTION = (
+    "speed_mps", "relative_speed_mps", "acceleration_mps2", "top_mps", "top_sigma_mps", "scatter_m", "straight_mps",
+    "climb_mps",
+)  # fmt: skip
+
+
+def named(c, span_m=0.5, motion_known=True):
+    return dict(zip(NAMES, features_of(c, span_m, motion_known).tolist(), strict=True))
+
+
+def test_the_names_are_distinct_and_each_has_a_text():
+    assert len(set(NAMES)) == len(NAMES)
+    assert all(feature.text and feature.monotone in (-1, 0, 1) for feature in FEATURES)
+
+
+def test_after_one_observation_no_motion_is_known():
+    features = named(candidate(observation(0.0)))
+    assert all(
+        math.isnan(features[name]) for name in (*MOTION, *TELEMETRY, "displacement_m", "passes_since_reacquired")
+    )
+    known = set(NAMES) - set(MOTION) - set(TELEMETRY) - {"displacement_m", "passes_since_reacquired"}
+    known -= {"speed_sigma_mps", "acceleration_sigma_mps2", "straight_sigmas"}
+    assert all(math.isfinite(features[name]) for name in known)
+
+
+def test_returns_are_relative_to_those_of_a_beam_across_the_drone():
+    features = named(candidate(observation(0.0, returns=4, range_m=20.0)), span_m=0.5)
+    assert features["return_ratio"] == pytest.approx(4 * 20.0 * PULSE_RAD / 0.5)
+    assert features["single_share"] == 0.0
+    one, two = observation(0.0, returns=1), observation(0.1, returns=3)
+    assert named(candidate(one, two))["single_share"] == 0.5
+
+
+def test_a_straight_flight_has_its_speed_and_climb_in_any_direction():
+    velocity = np.array([2.0, -1.0, 0.5])
+    for turn in (0.0, 1.2):
+        c = candidate(*path(rotation_z(turn) @ velocity, count=15))
+        features = named(c)
+        assert features["straight_mps"] == pytest.approx(np.linalg.norm(velocity))
+        assert features["speed_mps"] == pytest.approx(np.linalg.norm(velocity), rel=0.05)
+        assert features["climb_mps"] == pytest.approx(0.5)
+        assert features["displacement_m"] == pytest.approx(1.4 * np.linalg.norm(velocity))
+        assert features["straight_sigmas"] > 10
+        assert features["scatter_m"] < 0.05
+
+
+def test_a_static_object_has_no_significant_speed():
+    rng = np.random.default_rng(1)
+    c = candidate(*(observation(0.1 * k, PLACE_M + rng.normal(0, 0.06, 3)) for k in range(20)))
+    features = named(c)
+    assert features["straight_sigmas"] < 4
+    assert features["scatter_m"] == pytest.approx(0.06 * math.sqrt(3), rel=0.4)
+
+
+def test_free_sectors_and_the_least_observed_one():
+    seen = [observation(0.1 * k) for k in range(3)]
+    for one in seen:
+        one.isolation[FREE_0 : FREE_0 + 5] = 4
+    features = named(candidate(*seen))
+    assert (features["free_sectors"], features["least_free"]) == (5.0, 0.0)
+    for one in seen:
+        one.isolation[FREE_0 : FREE_0 + SECTORS] = 4
+    assert named(candidate(*seen))["least_free"] == 3.0
+
+
+def test_telemetry_is_a_part_of_the_same_features():
+    c = candidate(*path((1.0, 0.0, 0.0)))
+    c.add_log_ratios(MotionLogRatios(5.0, 4.0, 3.0, 2.0, 1.1, 0.9))
+    features = named(c)
+    assert [features[name] for name in TELEMETRY] == [5.0, 4.0, 3.0, 2.0, 2.0, 1.1, 0.9, 5.0, 0.9]
+    c.add_log_ratios(None)
+    assert all(math.isnan(named(c)[name]) for name in TELEMETRY)
+
+
+def test_repeated_observations_raise_the_existence_and_distant_ones_do_not():
+    repeated = candidate(*path((0.0, 0.0, 0.0), count=4))
+    scattered = candidate(*(observation(0.1 * k, PLACE_M + np.array([2.0 * (-1) ** k, 0.0, 0.0])) for k in range(4)))
+    assert named(repeated)["existence_nats"] > 10
+    assert named(repeated)["existence_nats"] > named(scattered)["existence_nats"] + 5
+
+
+def test_far_away_a_lamp_may_seem_to_move_as_far_as_a_drone():
+    near, far = (candidate(observation(0.0, range_m=r), observation(0.1, range_m=r)) for r in (15.0, 32.0))
+    for c in (near, far):
+        c.add_log_ratios(MotionLogRatios(9.0, 4.0, 3.0, 7.0, 1.1, 1.2))
+    far.flight_log_ratio = 0.0
+    assert (named(near)["displaced_nats"], named(near)["displaced_m"]) == (7.0, 1.2)
+    assert named(far)["displaced_nats"] == NOT_DISPLACED_NATS
+    assert named(far)["displaced_m"] == pytest.approx(1.2 - lamp_sway_m(32.0))

@@ -32,7 +32,7 @@ def test_every_relative_link_leads_to_a_file(file):
 
 @pytest.mark.parametrize("file", DOCUMENTS, ids=name_of)
 def test_every_command_in_a_document_exists(file):
-    for command in re.findall(r"(?:^    |`|bin/)grd ([a-z]+)\b", file.read_text(encoding="utf-8"), re.M):
+    for command in re.findall(r"(?:^    |`|bin/)grd ([a-z]+(?:-[a-z]+)*)\b", file.read_text(encoding="utf-8"), re.M):
         assert command in COMMANDS, f"{name_of(file)} names `grd {command}`"
 
 

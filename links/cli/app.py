@@ -32,7 +32,10 @@ COMMANDS = {
     "view": ("files:view", "Open a run in the Rerun viewer, or write a screenshot of it."),
     "preflight": ("preflight:preflight", "Check LiDAR, servo, cameras, autopilot, clocks, parameters, axes and disk."),
     "calibrate": ("calibrate:calibrate_recording", "Estimate the LiDAR's mount on its servo."),
-    "lens": ("lens:import_lens", "Write the lens in FILE as a rig file, to include in a configuration after its rig."),
+    "lens": (
+        "links.importing.lens:import_lens",
+        "Write the lens in FILE as a rig file, to include in a configuration after its rig.",
+    ),
     "train-detector": (
         "links.training.command:train_detector",
         "Train the detector's model and score it on held-out runs.",

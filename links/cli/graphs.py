@@ -20,7 +20,7 @@ from flow.config_error import ConfigError
 from flow.graph import Graph, load_graph
 from links.cli.console import EXIT_FAILED, EXIT_USAGE, err, out, report_errors, warn
 from links.cli.run import Config, Overlay, Sets
-from links.runs.shipped_values import shipped_values
+from links.preflight.shipped_values import shipped_values
 from links.zenoh import host_graph
 
 OutFile = Annotated[Path | None, typer.Option("--out", "-o", help="File to write [default: the terminal].")]

@@ -17,6 +17,7 @@ from links.cli.console import EXIT_FAILED, err, out, progress_bar, report_errors
 from links.cli.live_view import LiveView
 from links.cli.run_output import nothing_found, print_result
 from links.cli.side_by_side import side_by_side
+from links.preflight.shipped_values import shipped_values
 from links.runs.as_live import rerun_into
 from links.runs.live_run import live_graph, run_live
 from links.runs.output_hashes import hash_matches
@@ -24,7 +25,6 @@ from links.runs.request import RunRequest, RunResult
 from links.runs.results import SUMMARY_FILE
 from links.runs.run_folder import replay_into
 from links.runs.shipped import CONFIGS, shipped, shipped_all, shipped_option
-from links.runs.shipped_values import shipped_values
 from links.runs.warm_up import warm_up
 from links.zenoh import host_graph
 

@@ -29,6 +29,7 @@ from stages.messages import LidarFirings
 
 Entry = tuple[str, str, int, dict[str, Any]]  # topic, type, time of recording [ns], values
 CLOUD_NS = 100_000_000
+PACKET_MS = 0.1  # shorter than any packet: a message each, none is left over at the end
 TF = "tf2_msgs/msg/TFMessage"
 _POINT = np.dtype(
     [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("ring", "<u2"), ("t", "<u4")]  # t: ns after stamp
@@ -66,7 +67,7 @@ class RecordingMessages:
         self._source = source
         self._rig: dict[str, Any] = {} if rig_yaml is None else yaml_values(rig_yaml)
         self._unit = rig_unit(rig_yaml, source) if rig_yaml is not None and "lidar" in self._rig else None
-        self._lidar = None if self._unit is None else Lidar(unit=self._unit)
+        self._lidar = None if self._unit is None else Lidar(unit=self._unit, slice_ms=PACKET_MS)
         self._packets: list[Record] = []
         self._firings: list[LidarFirings] = []
         self._static_sent = False

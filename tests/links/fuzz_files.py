@@ -13,9 +13,9 @@ from flow.config_error import ConfigError
 from flow.graph import load_graph
 from flow.link import LinkError
 from links.cli.files import read_rig
-from links.cli.lens import read_lens
 from links.evaluation.text_files import read_tum
 from links.importing import import_file
+from links.importing.lens import read_lens
 from links.runs import as_live
 from tests.links.importing.captures import ethernet, pcap, udp
 from tests.links.importing.test_import_tlog import frames, tlog

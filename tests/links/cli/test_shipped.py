@@ -9,8 +9,8 @@ import pytest
 
 from flow.graph import load_graph
 from links import __version__
+from links.preflight.shipped_values import shipped_values
 from links.runs.shipped import CONFIGS, RECORDINGS, shipped
-from links.runs.shipped_values import shipped_values
 from tests.links import command
 
 QUIET = """\

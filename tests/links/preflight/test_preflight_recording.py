@@ -26,7 +26,7 @@ def test_a_flight_with_every_sensor_is_go():
         "--no-motion",
         code=0,
     )
-    assert "ok    lidar losses: 0 of 22607 packets lost" in text
+    assert "ok    lidar losses: 0 of 22606 packets lost" in text
     assert "ok    camera_drone size: 480 x 480, as in the rig" in text
     assert "ok    autopilot rates: ATTITUDE 50 Hz, ODOMETRY 30 Hz" in text
     assert "warn  autopilot parameters: not in a recording: not checked" in text

@@ -31,7 +31,7 @@ needs_shared_data = pytest.mark.skipif(not OTHER.is_dir(), reason="the shared da
 
 
 def decoded(records: Any, unit: RigLidar) -> list[LidarFirings]:
-    lidar = Lidar(unit=unit)
+    lidar = Lidar(unit=unit, slice_ms=0.1)
     firings = [m for r in records if (m := lidar.decode(r)) is not None]
     assert lidar.counters["lost"] == 0
     return firings

@@ -37,8 +37,9 @@ def train_detector(
 ) -> None:
     """Train the detector's model and score it on held-out runs.
 
-    The scores are next to those of the probabilities that the runs logged. The same runs and library versions give the same file, which names the command, the seeds and the scores. Brier
-    score and log loss are over classifications of candidates, by range, with and without telemetry.
+    The scores are next to those of the probabilities that the runs logged. The same runs and library versions give the
+    same file, which names the command, the seeds and the scores. Brier score and log loss are over classifications of
+    candidates, by range, with and without telemetry.
 
     Example: grd train-detector out/runs/*-detector -o configs/detector_model.yaml --held-out out/held_out
     """

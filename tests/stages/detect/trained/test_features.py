@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from stages.detect.motion_log_ratios import MotionLogRatios
 from stages.detect.flight import lamp_sway_m
+from stages.detect.motion_log_ratios import MotionLogRatios
 from stages.detect.trained.features import FEATURES, NAMES, NOT_DISPLACED_NATS, PULSE_RAD, features_of
 from stages.geometry.frames import rotation_z
 from stages.kernels.detect.isolation import FREE_0, SECTORS

@@ -32,7 +32,11 @@ def test_after_the_switch_it_hovers_on_what_it_is_sent(kind: str, sets: str) -> 
 
 @pytest.mark.parametrize(("sets", "flies"), [(["gps", "external_position"], True), (["external_no_velocity"], False)])
 def test_px4_takes_positions_without_rotation_only_with_a_compass(sets: list[str], flies: bool) -> None:
-    plan = [{"do": "path", "for_s": 4}, *([{"do": "use_sources", "set": 2}] if flies else []), {"do": "hold", "for_s": 60}]
+    plan = [
+        {"do": "path", "for_s": 4},
+        *([{"do": "use_sources", "set": 2}] if flies else []),
+        {"do": "hold", "for_s": 60},
+    ]
     host = Host(16.0, kind="px4", source_sets=sets, plan=plan, autopilot={"heading_of_world_x_deg": 0.0})
 
     def in_ned(message, time_s: float) -> None:

@@ -22,7 +22,7 @@ from scipy.optimize import minimize
 from flow.link import LinkError
 from links.training.candidates import CandidateRows
 from stages.detect.trained.features import FEATURES, NAMES, RANGE, TELEMETRY, VERSION
-from stages.detect.trained.model import ALTERNATIVES, ANY, FAR, NEAR, DetectorModel, Term, farness
+from stages.detect.trained.model import ALTERNATIVES, ANY, FAR, NEAR, At, DetectorModel, Term, farness
 from stages.geometry.frames import Array64
 
 KNOTS = 6
@@ -75,7 +75,7 @@ class _Column:
 
     alternative: int
     feature: str
-    at: str  # any, near or far
+    at: At
     low: float
     high: float
     sign: int
@@ -237,8 +237,8 @@ def _left_out_loss(
 
 def _model(columns: Sequence[_Column], theta: Array64, trained: dict[str, Any]) -> DetectorModel:
     priors = np.zeros((len(ALTERNATIVES), 2))
-    ramps: dict[tuple[int, str, str], list[tuple[_Column, float]]] = {}
-    missing: dict[tuple[int, str, str], float] = {}
+    ramps: dict[tuple[int, str, At], list[tuple[_Column, float]]] = {}
+    missing: dict[tuple[int, str, At], float] = {}
     for c, value in zip(columns, theta.tolist(), strict=True):
         if not c.feature:
             priors[c.alternative, int(c.low)] = value

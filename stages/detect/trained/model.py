@@ -32,7 +32,10 @@ from stages.kernels.detect.model import evaluate
 
 ALTERNATIVES = tuple(Alternative)
 NEAR_M, FAR_M = 12.0, 30.0  # of terms near and far
-ANY, NEAR, FAR = "any", "near", "far"
+At = Literal["any", "near", "far"]
+ANY: At = "any"
+NEAR: At = "near"
+FAR: At = "far"
 REASONS = 3  # contributions named for people
 LEAST_NATS = 0.1  # contributions below are not named
 
@@ -57,7 +60,7 @@ class Term(BaseModel):
 
     alternative: int = Field(ge=0, lt=len(ALTERNATIVES))
     feature: str
-    at: Literal["any", "near", "far"] = "any"
+    at: At = "any"
     knots: tuple[float, ...] = Field(min_length=2)
     values: tuple[float, ...] = Field(min_length=2)  # [nats] at the knots
     missing: float = 0.0

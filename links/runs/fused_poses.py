@@ -112,7 +112,8 @@ def _errors(
         rows, before, after = own[between.known], between.before[between.known], between.after[between.known]
         weight = between.weight[between.known][:, None]
         error_m[rows] = xyz_m[rows] - ((1 - weight) * true_m[before] + weight * true_m[after])
-        R_true = Rotation.from_quat(truth.rotation_in_vehicle(number))
-        step = (R_true[before].inv() * R_true[after]).as_rotvec()
-        angle_rad[rows] = (R[rows].inv() * R_true[before] * Rotation.from_rotvec(weight * step)).magnitude()
+        true_xyzw = truth.rotation_in_vehicle(number)
+        R_before, R_after = Rotation.from_quat(true_xyzw[before]), Rotation.from_quat(true_xyzw[after])
+        between_R = R_before * Rotation.from_rotvec(weight * (R_before.inv() * R_after).as_rotvec())
+        angle_rad[rows] = (Rotation.from_quat(R.as_quat()[rows]).inv() * between_R).magnitude()
     return error_m, angle_rad

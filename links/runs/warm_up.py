@@ -35,7 +35,7 @@ def warm_up(graph: Graph, progress: Progress, recording: Path = RECORDING) -> st
                 progress(record.arrival_ns - first_ns, REPLAYED_NS)
                 if not record.topic.startswith(TRUTH_TOPICS):
                     runner.feed(record)
-            progress(1.0, 1.0)
+            progress(REPLAYED_NS, REPLAYED_NS)
             runner.finish()
     except (LinkError, RunError) as error:
         return f"warm-up on {recording.name} failed, the first messages may be late: {error}"

@@ -62,4 +62,4 @@ def undecided_reason(estimator: Estimator, now_ns: int) -> str:
         return "its sigma exceeds yaw_sigma_deg: accelerate sideways"
     if e.heading.near_probability > DECIDED and not e.is_own:
         return "not certain that the tracked object moves as the drone's IMU measures: accelerate sideways"
-    return f"P(yaw within 20 deg) {e.heading.near_probability:.3f}, needs {DECIDED} for 0.8 s: accelerate sideways"
+    return f"P(right yaw) {e.heading.near_probability:.3f}, needs {DECIDED} for 0.8 s: accelerate sideways"

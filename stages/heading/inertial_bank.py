@@ -54,6 +54,7 @@ DROPPED = 1e-8  # a less probable hypothesis is dropped
 LOSS = 0.2  # of information [nat] below which two hypotheses may be merged, for each unit of their probability
 ALIKE_RAD = math.radians(3.0)
 NEAR_RAD = math.radians(20.0)
+STREET_RAD = math.radians(10.0)  # streets are this far apart, or more
 LEAST_CANDIDATE = 0.05  # a less probable hypothesis is not the best one
 
 
@@ -65,12 +66,12 @@ class YawMixture:
     variance_rad2: Array64  # (n,)
     weight: Array64  # (n,) sums to 1
 
-    def best(self) -> tuple[int, float]:
-        """Index of the part with the most probability within 20 deg, and that probability."""
+    def best(self, reach_rad: float) -> tuple[int, float]:
+        """Index of the part with the most probability within a reach, and that probability."""
         sigma = np.sqrt(self.variance_rad2)
         near = np.zeros(len(sigma))
         for i in np.flatnonzero(self.weight > LEAST_CANDIDATE):
-            near[i] = _within(self.yaw_rad - self.yaw_rad[i], sigma, NEAR_RAD) @ self.weight
+            near[i] = _within(self.yaw_rad - self.yaw_rad[i], sigma, reach_rad) @ self.weight
         best = int(np.argmax(near))
         return best, float(near[best])
 

@@ -3,8 +3,9 @@
 The bank of hypotheses is propagated by the IMU from measurement to measurement, in the order of their times. A
 measurement a little older than the bank is moved to the bank's time by the drone's own motion since.
 
-The heading is decided when for DECIDED_FOR_NS, at every LiDAR position, the yaws within 20 deg of the best one together
-have P > 0.999, and the object is the drone (ownership.py): both probabilities may exceed their thresholds for a moment.
+The heading is decided when for DECIDED_FOR_NS, at every LiDAR position, the yaws within 20 deg of the best one (10 deg
+while the bank follows answers of cameras, which may be of another street) together have P > 0.999, and the object is
+the drone (ownership.py): both probabilities may exceed their thresholds for a moment.
 
 Source: ours; issue: heading once.
 """
@@ -18,7 +19,7 @@ import numpy as np
 from stages.geometry.frames import Array64
 from stages.heading import bank_measurements as measure
 from stages.heading.imu_buffer import ImuBuffer
-from stages.heading.inertial_bank import NEAR_RAD, InertialBank, YawMixture, start
+from stages.heading.inertial_bank import NEAR_RAD, STREET_RAD, InertialBank, YawMixture, start
 from stages.heading.inertial_state import POSITION, ImuIntervals, InertialState
 from stages.heading.odometry_heading import YawEvidence
 from stages.heading.rotation_answers import Answers, add_answers
@@ -44,7 +45,7 @@ class InertialHeading:
         self.evidence: YawEvidence | None = None
         self._certain_ns: int | None = None  # since when both probabilities have exceeded their thresholds
         self.decided = False  # whether the heading is known
-        self.near_probability = 0.0  # of a yaw within 20 deg of the best one, at the newest LiDAR position
+        self.near_probability = 0.0  # of a yaw within reach of the best one, at the newest LiDAR position
         self._direction_ns = 0
         self._disagreed = 0  # consecutive images
 
@@ -92,7 +93,7 @@ class InertialHeading:
         measure.add_position(self.bank, xyz_m, covariance_m2)
         log_evidence = self.bank.log_evidence
         self.bank.tidy()
-        self.near_probability = self.yaws().best()[1]
+        self.near_probability = self.yaws().best(self._reach_rad)[1]
         return log_evidence
 
     def decide(self, is_own: bool) -> None:
@@ -118,6 +119,11 @@ class InertialHeading:
             self.bank.tied[:] = False
             self._disagreed = 0
         return right
+
+    @property
+    def _reach_rad(self) -> float:
+        """How near to the best yaw counts as right: less while cameras may match another street."""
+        return STREET_RAD if self.bank is not None and bool(self.bank.tied.any()) else NEAR_RAD
 
     @property
     def cameras_confirmed(self) -> bool:
@@ -168,7 +174,7 @@ class InertialHeading:
         """
         assert self.bank is not None
         bank, yaws = self.bank, self.yaws()
-        off = bank.state.yaw_rad - yaws.yaw_rad[yaws.best()[0]]
+        off = bank.state.yaw_rad - yaws.yaw_rad[yaws.best(self._reach_rad)[0]]
         near = np.flatnonzero(np.abs(np.remainder(off + math.pi, 2 * math.pi) - math.pi) <= 1.5 * NEAR_RAD)
         return InertialBank(bank.state.rows(near), bank.log_weight[near]).mean()
 

@@ -16,7 +16,7 @@ class HeadingEstimate(Message):
     sigma_rad: PerPointF64
     probability: PerPointF64  # sums to 1
     vehicle_yaw_rad: float  # yaw of R_map_vehicle at stamp_ns
-    near_probability: float  # probability of a yaw within 20 deg of the first one
+    near_probability: float  # probability of a yaw within 20 deg of the best one; 10 deg with cameras
     decided: bool  # near_probability has exceeded 0.999 for 0.8 s and the object is the drone
     reason: str  # what the estimate rests on, or why it is not decided
 

@@ -316,6 +316,7 @@ def test_every_time_field_of_the_messages_is_known():
     assert found == {
         "AutopilotStatus.clock_offset_ns": False,
         "AutopilotStatus.clock_uncertainty_ns": True,
+        "CandidateLog.seen_ns": False,
         "Candidates.seen_ns": False,
         "DepthImage.start_ns": False,
         "Detections.evidence.seen_ns": False,

@@ -8,7 +8,7 @@ import numpy as np
 
 from stages.geometry.frames import rotation_z
 from stages.heading import bank_measurements as measure
-from stages.heading.inertial_bank import InertialBank, level, moments, start
+from stages.heading.inertial_bank import NEAR_RAD, InertialBank, level, moments, start
 from stages.heading.inertial_state import GRAVITY_MPS2, ImuIntervals, InertialState, exp_rotations, predict
 from stages.kernels.geometry.so3 import exp_rotation, log_rotation
 from stages.kernels.heading.preintegration import preintegrate
@@ -81,7 +81,7 @@ def test_hypotheses_surround_the_circle_and_are_level():
     assert np.allclose(
         np.sort(np.remainder(bank.state.yaw_rad, 2 * math.pi)), 2 * math.pi / 12 * np.arange(12), atol=0.02
     )
-    assert bank.yaws.best()[1] < 0.3
+    assert bank.yaws.best(NEAR_RAD)[1] < 0.3
 
 
 def test_an_update_moves_towards_the_measurement_and_an_outlier_does_not():
@@ -105,7 +105,7 @@ def test_a_direction_of_flight_selects_the_yaw():
     true = rotation_z(2.0)
     for _ in range(6):
         measure.add_direction(bank, true.T @ np.array([1.0, 0.0, 0.0]), 0.05, 0.1)
-    best, near = bank.yaws.best()
+    best, near = bank.yaws.best(NEAR_RAD)
     assert abs(math.remainder(bank.state.yaw_rad[best] - 2.0, 2 * math.pi)) < 0.1
     assert near > 0.99
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from stages.geometry.frames import rotation_z
-from stages.heading.inertial_bank import YawMixture
+from stages.heading.inertial_bank import NEAR_RAD, YawMixture
 from stages.heading.odometry_heading import OdometryHeading
 from stages.heading.ownership import Ownership, log_evidence
 
@@ -83,7 +83,7 @@ def test_evidence_narrows_a_yaw_that_is_not_known_and_keeps_the_wrong_compass_be
     assert evidence is not None
     wide = YawMixture(2 * math.pi / 12 * np.arange(12), np.full(12, math.radians(18.0) ** 2), np.full(12, 1 / 12))
     after = evidence.applied(wide)
-    best, near = after.best()
+    best, near = after.best(NEAR_RAD)
     assert abs(math.remainder(after.yaw_rad[best] - evidence.yaw_rad, 2 * math.pi)) < math.radians(5.0)
     assert 0.93 < near < 0.999
 

@@ -53,8 +53,8 @@ SPLIT_SHARE, SPLIT_SHIFT, SPLIT_SIGMA = 0.2252, 1.0566, 0.6716
 DROPPED = 1e-8  # a less probable hypothesis is dropped
 LOSS = 0.2  # of information [nat] below which two hypotheses may be merged, for each unit of their probability
 ALIKE_RAD = math.radians(3.0)
-NEAR_RAD = math.radians(20.0)
-STREET_RAD = math.radians(10.0)  # streets are this far apart, or more
+NEAR_RAD = math.radians(20.0)  # a yaw this near to the right one counts as right
+WITH_CAMERAS_RAD = math.radians(10.0)  # the same, while answers of cameras may be of another street
 LEAST_CANDIDATE = 0.05  # a less probable hypothesis is not the best one
 
 
@@ -121,6 +121,14 @@ class InertialBank:
         """Other hypotheses, with log weights (n,) that need not be normalised."""
         self.state, self.log_weight, self.tied = state, log_weight - _log_sum(log_weight), tied
         self.tidy()
+
+    def drop_tied(self) -> None:
+        """The answers of both cameras are wrong: the free hypotheses remain. Without any, the others become free."""
+        free = np.flatnonzero(~self.tied)
+        if len(free):
+            self.replace(self.state.rows(free), self.log_weight[free], self.tied[free])
+        else:
+            self.tied = np.zeros(len(self.state), dtype=np.bool_)
 
     def tidy(self) -> None:
         """Drop improbable hypotheses, split wide ones and merge those that agree."""

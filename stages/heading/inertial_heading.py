@@ -19,7 +19,7 @@ import numpy as np
 from stages.geometry.frames import Array64
 from stages.heading import bank_measurements as measure
 from stages.heading.imu_buffer import ImuBuffer
-from stages.heading.inertial_bank import NEAR_RAD, STREET_RAD, InertialBank, YawMixture, start
+from stages.heading.inertial_bank import NEAR_RAD, WITH_CAMERAS_RAD, InertialBank, YawMixture, start
 from stages.heading.inertial_state import POSITION, ImuIntervals, InertialState
 from stages.heading.odometry_heading import YawEvidence
 from stages.heading.rotation_answers import Answers, add_answers
@@ -28,7 +28,7 @@ from stages.messages import VisualMotion
 
 DECIDED, DECIDED_FOR_NS = 0.999, 800_000_000
 CONFIRMED = 0.99  # probability from which the answers of both cameras are taken as right
-DISAGREE = 8  # consecutive images that disagree with the earlier ones: another street
+DISAGREE = 8  # consecutive images that contradict all tied hypotheses: their answers were wrong
 LATE_NS = 500_000_000  # an older measurement is not used
 DIRECTION_NS = 400_000_000  # between directions of flight by images that count as independent
 LONGEST_TURN_NS = 300_000_000
@@ -116,14 +116,14 @@ class InertialHeading:
         right = add_answers(self.bank, answers.turned(*self.turn(stamp_ns, self.stamp_ns)), share)
         self._disagreed = 0 if right > 0.5 else self._disagreed + 1
         if self._disagreed >= DISAGREE or self.bank.weight[self.bank.tied].sum() < 1.0 - DECIDED:
-            self.bank.tied[:] = False
+            self.bank.drop_tied()
             self._disagreed = 0
         return right
 
     @property
     def _reach_rad(self) -> float:
         """How near to the best yaw counts as right: less while cameras may match another street."""
-        return STREET_RAD if self.bank is not None and bool(self.bank.tied.any()) else NEAR_RAD
+        return WITH_CAMERAS_RAD if self.bank is not None and bool(self.bank.tied.any()) else NEAR_RAD
 
     @property
     def cameras_confirmed(self) -> bool:

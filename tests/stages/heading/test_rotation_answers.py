@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from stages.geometry.frames import rotation_z
-from stages.heading.inertial_bank import InertialBank, start
+from stages.heading.imu_buffer import ImuBuffer
+from stages.heading.inertial_bank import InertialBank, joined, start
+from stages.heading.inertial_heading import DISAGREE, InertialHeading
 from stages.heading.inertial_state import THETA, InertialState
 from stages.heading.rotation_answers import Answers, add_answers, combine
 from stages.kernels.geometry.so3 import exp_rotation
@@ -75,6 +77,36 @@ def test_an_answer_that_returns_more_often_wins_among_the_tied_hypotheses():
         add_answers(bank, answers(54.0), 0.2)
     assert near(bank, 54.0) > 5 * near(bank, 20.0)
     assert bank.weight[bank.tied].sum() == pytest.approx(0.9, abs=0.05)
+
+
+def test_answers_that_later_images_contradict_leave_the_free_hypotheses_alone():
+    heading = InertialHeading(ImuBuffer())
+    heading.start(0, np.zeros(3), 0.01 * np.eye(3), None, UP)
+    heading.add_rotation(0, answers(20.0), 1.0)
+    for _ in range(DISAGREE - 1):
+        heading.add_rotation(0, answers(60.0), 0.1)
+    assert heading.bank is not None
+    assert heading.bank.tied.any()
+    heading.add_rotation(0, answers(60.0), 0.1)
+    assert not heading.bank.tied.any()
+    assert near(heading.bank, 20.0) == near(heading.bank, 60.0) == 0.0
+    heading.add_rotation(0, answers(60.0), 0.1)
+    assert near(heading.bank, 60.0) == pytest.approx(0.9, abs=0.05)
+
+
+def test_a_street_15_deg_beside_that_of_the_cameras_keeps_the_heading_undecided():
+    """Without cameras yaws within 20 deg of each other count as the same."""
+    near_probability = {}
+    for tied in (True, False):
+        heading = InertialHeading(ImuBuffer())
+        heading.resume(0, decided(0.0, 0.3))
+        assert heading.bank is not None
+        both = joined([decided(0.0, 0.3), decided(15.0, 1.5)])
+        heading.bank.replace(both, np.log([0.97, 0.03]), np.array([tied, False]))
+        heading.add_position(np.zeros(3), 0.01 * np.eye(3))
+        near_probability[tied] = heading.near_probability
+    assert near_probability[True] == pytest.approx(0.97, abs=0.01)
+    assert near_probability[False] > 0.999
 
 
 def test_an_answer_with_another_tilt_is_not_used():

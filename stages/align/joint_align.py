@@ -118,7 +118,7 @@ class JointAlign(Stage[JointAlignSettings]):
         others = "" if len(found) == 1 else f", {len(found)} matches"
         return RelativeRotation(
             stamp_ns=drone_ns,
-            answers=np.array([turn @ one.R_vehicle_drone(0) for one, _ in found]),
+            rotations=np.array([turn @ one.R_vehicle_drone(0) for one, _ in found]),
             covariances_rad2=np.array([one.covariance_rad2(0) + variance_rad2 * np.eye(3) for one, _ in found]),
             probabilities=np.array([p for _, p in found]),
             branch_probability=np.full(4, probability / 4),

@@ -30,7 +30,7 @@ from stages.heading.inertial_heading import InertialHeading, bias_free_turn, tur
 from stages.heading.inertial_state import POSITION, InertialState
 from stages.heading.odometry_heading import OdometryHeading, OdomYaw
 from stages.heading.ownership import Ownership, log_evidence
-from stages.heading.rotation_answers import Answers, combine
+from stages.heading.rotation_matches import RotationMatches, combine
 from stages.messages import DroneFix, DroneMotion, RelativeRotation, VisualMotion
 
 TILT_TIME_S = 20.0  # time constant of the error of roll and pitch
@@ -59,7 +59,7 @@ class Estimator:
         self.fix_ns: int | None = None  # newest LiDAR position used
         self.newest_fix_ns: int | None = None  # also when the drone is lost
         self.rotation_ns: int | None = None  # newest rotation by vanishing points used
-        self._cameras_confirmed = False  # the graph was started with confirmed answers of both cameras
+        self._cameras_confirmed = False  # the graph was started with confirmed matches of both cameras
         self.nis = math.nan
         self.bias_covariance_m2 = np.zeros((3, 3))
         self.rotation_bias_rad2 = np.zeros((3, 3))
@@ -186,7 +186,7 @@ class Estimator:
             self.rotation_ns = None
 
     def _to_bank(self) -> None:
-        """Go on with the bank, from the graph's state: the IMU has ended, or cameras give their first answers."""
+        """Go on with the bank, from the graph's state: the IMU has ended, or cameras give their first matches."""
         self.heading.resume(self.graph.stamp_ns, self.graph.state)
         self.graph.stop()
 
@@ -308,32 +308,32 @@ class Estimator:
                 self.heading.evidence = self.odometry.evidence(stamp_ns, own.R_odom_drone)
 
     def _use_rotation(self, rotation: RelativeRotation) -> None:
-        if not (len(rotation.answers) and self.known and self._vehicle.in_current_frame(rotation.stamp_ns)):
+        if not (len(rotation.rotations) and self.known and self._vehicle.in_current_frame(rotation.stamp_ns)):
             return
         stamp_ns, bias_share = rotation.stamp_ns, self._errors.rotation_bias_share
         R_map_vehicle = self._vehicle.at(stamp_ns)[0]
         white = (1.0 - bias_share) * rotation.covariances_rad2
-        answers = Answers(R_map_vehicle @ rotation.answers, white, rotation.probabilities, R_map_vehicle)
+        matches = RotationMatches(R_map_vehicle @ rotation.rotations, white, rotation.probabilities, R_map_vehicle)
         factor = self._rotation_inflation.factor(stamp_ns)
         if self.graph.running and not self._cameras_confirmed:
             self._to_bank()
         if not self.graph.running:
             self.heading.advance(stamp_ns)
-            used = (self.heading.add_rotation(stamp_ns, answers, 1.0 / factor) or 0.0) > 0.5
+            used = (self.heading.add_rotation(stamp_ns, matches, 1.0 / factor) or 0.0) > 0.5
         elif abs(stamp_ns - self.graph.stamp_ns) > LATEST_NS:
             self.too_late += 1
             return
         else:
-            used = self._add_rotation_to_graph(stamp_ns, answers, factor)
+            used = self._add_rotation_to_graph(stamp_ns, matches, factor)
         if used:
             self.rotation_ns = stamp_ns
             self.rotation_bias_rad2 = bias_share * rotation.covariances_rad2[0]
 
-    def _add_rotation_to_graph(self, stamp_ns: int, answers: Answers, factor: float) -> bool:
-        """Add the answers as one rotation, its variance times `factor`. Whether it is in the estimate."""
+    def _add_rotation_to_graph(self, stamp_ns: int, matches: RotationMatches, factor: float) -> bool:
+        """Add the matches as one rotation, its variance times `factor`. Whether it is in the estimate."""
         graph = self.graph
         turn = turn_between(self.imu, stamp_ns, graph.stamp_ns, graph.state.bias[0])
-        one = combine(graph.state, answers.turned(*turn))
+        one = combine(graph.state, matches.turned(*turn))
         if one.R_map_drone is None:
             if self._rejected_rotations.add(stamp_ns, one.residual_rad, one.covariance_rad2):
                 self.forget()

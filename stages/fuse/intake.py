@@ -58,11 +58,11 @@ class Intake:
         return self.is_valid(fix, "fix", *numbers) and self.is_covariance(fix.covariance_m2 - bias_m2, "fix")
 
     def is_valid_rotation(self, rotation: RelativeRotation) -> bool:
-        """Whether the rotations by cameras can be used; a message without an answer is not counted as rejected."""
-        if not len(rotation.answers):
+        """Whether the rotations by cameras can be used; a message without a match is not counted as rejected."""
+        if not len(rotation.rotations):
             return False
         p, covariances = rotation.probabilities, rotation.covariances_rad2
-        if not self.is_valid(rotation, "rotation", rotation.answers, covariances, p):
+        if not self.is_valid(rotation, "rotation", rotation.rotations, covariances, p):
             return False
         if not (p.min() > 0.0 and p.sum() <= 1.0 + 1e-9):
             self.rejected["rotation: its probabilities are not positive with a sum of at most 1"] += 1

@@ -5,7 +5,7 @@
     direction of flight |v| d = R^T v, by the drone's camera
     turn between images the gyroscope's mean rate less the mean rate by images is the gyroscope's bias
 
-Rotations by both cameras: rotation_answers.py.
+Rotations by both cameras: rotation_matches.py.
 
 Source: ours.
 """

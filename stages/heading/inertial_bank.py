@@ -54,7 +54,7 @@ DROPPED = 1e-8  # a less probable hypothesis is dropped
 LOSS = 0.2  # of information [nat] below which two hypotheses may be merged, for each unit of their probability
 ALIKE_RAD = math.radians(3.0)
 NEAR_RAD = math.radians(20.0)  # a yaw this near to the right one counts as right
-WITH_CAMERAS_RAD = math.radians(10.0)  # the same, while answers of cameras may be of another street
+WITH_CAMERAS_RAD = math.radians(10.0)  # the same, while matches of cameras may be of another street
 LEAST_CANDIDATE = 0.05  # a less probable hypothesis is not the best one
 
 
@@ -81,7 +81,7 @@ class InertialBank:
 
     def __init__(self, state: InertialState, log_weight: Array64) -> None:
         self.state, self.log_weight = state, log_weight - _log_sum(log_weight)
-        self.tied = np.zeros(len(state), dtype=np.bool_)  # to an answer of both cameras (rotation_answers.py)
+        self.tied = np.zeros(len(state), dtype=np.bool_)  # to a match of both cameras (rotation_matches.py)
         self.log_evidence = 0.0  # log density of the newest measurement, outliers included
 
     @property
@@ -123,7 +123,7 @@ class InertialBank:
         self.tidy()
 
     def drop_tied(self) -> None:
-        """The answers of both cameras are wrong: the free hypotheses remain. Without any, the others become free."""
+        """The matches of both cameras are wrong: the free hypotheses remain. Without any, the others become free."""
         free = np.flatnonzero(~self.tied)
         if len(free):
             self.replace(self.state.rows(free), self.log_weight[free], self.tied[free])

@@ -4,7 +4,7 @@ The bank of hypotheses is propagated by the IMU from measurement to measurement,
 measurement a little older than the bank is moved to the bank's time by the drone's own motion since.
 
 The heading is decided when for DECIDED_FOR_NS, at every LiDAR position, the yaws within 20 deg of the best one (10 deg
-while the bank follows answers of cameras, which may be of another street) together have P > 0.999, and the object is
+while the bank follows matches of cameras, which may be of another street) together have P > 0.999, and the object is
 the drone (ownership.py): both probabilities may exceed their thresholds for a moment.
 
 Source: ours; issue: heading once.
@@ -22,13 +22,13 @@ from stages.heading.imu_buffer import ImuBuffer
 from stages.heading.inertial_bank import NEAR_RAD, WITH_CAMERAS_RAD, InertialBank, YawMixture, start
 from stages.heading.inertial_state import POSITION, ImuIntervals, InertialState
 from stages.heading.odometry_heading import YawEvidence
-from stages.heading.rotation_answers import Answers, add_answers
+from stages.heading.rotation_matches import RotationMatches, add_matches
 from stages.kernels.geometry.so3 import log_rotation
 from stages.messages import VisualMotion
 
 DECIDED, DECIDED_FOR_NS = 0.999, 800_000_000
-CONFIRMED = 0.99  # probability from which the answers of both cameras are taken as right
-DISAGREE = 8  # consecutive images that contradict all tied hypotheses: their answers were wrong
+CONFIRMED = 0.99  # probability from which the matches of both cameras are taken as right
+DISAGREE = 8  # consecutive images that contradict all tied hypotheses: their matches were wrong
 LATE_NS = 500_000_000  # an older measurement is not used
 DIRECTION_NS = 400_000_000  # between directions of flight by images that count as independent
 LONGEST_TURN_NS = 300_000_000
@@ -62,6 +62,7 @@ class InertialHeading:
         velocity = None if velocity_mps is None else (velocity_mps, FREE_SIGMA_MPS)
         self.bank = start(xyz_m, covariance_m2, velocity, up_drone, memory)
         self.stamp_ns, self.evidence, self._certain_ns, self.decided = stamp_ns, None, None, False
+        self._disagreed = 0
 
     def resume(self, stamp_ns: int, state: InertialState) -> None:
         """Continue from one decided hypothesis (one row)."""
@@ -109,11 +110,11 @@ class InertialHeading:
         if self.bank is not None:
             measure.add_vertical(self.bank, up_drone, sigma_rad)
 
-    def add_rotation(self, stamp_ns: int, answers: Answers, share: float) -> float | None:
+    def add_rotation(self, stamp_ns: int, matches: RotationMatches, share: float) -> float | None:
         """Add rotations by cameras, of which `share` is new evidence. Returns P that one is right; None: too old."""
         if self.bank is None or self._late_s(stamp_ns) is None:
             return None
-        right = add_answers(self.bank, answers.turned(*self.turn(stamp_ns, self.stamp_ns)), share)
+        right = add_matches(self.bank, matches.turned(*self.turn(stamp_ns, self.stamp_ns)), share)
         self._disagreed = 0 if right > 0.5 else self._disagreed + 1
         if self._disagreed >= DISAGREE or self.bank.weight[self.bank.tied].sum() < 1.0 - DECIDED:
             self.bank.drop_tied()
@@ -127,12 +128,12 @@ class InertialHeading:
 
     @property
     def cameras_confirmed(self) -> bool:
-        """Whether the drone's motion confirms the answers of both cameras."""
+        """Whether the drone's motion confirms the matches of both cameras."""
         return self.bank is not None and float(self.bank.weight[self.bank.tied].sum()) > CONFIRMED
 
     @property
     def cameras_open(self) -> bool:
-        """Whether the answers of both cameras may be right or wrong."""
+        """Whether the matches of both cameras may be right or wrong."""
         return self.bank is not None and bool(self.bank.tied.any()) and not self.cameras_confirmed
 
     def add_visual_motion(self, motion: VisualMotion) -> None:

@@ -52,27 +52,27 @@ class BranchState(enum.Enum):
 class RelativeRotation(Message):
     """R_vehicle_drone by both cameras; stamp_ns is the images'. P IV.
 
-    The lines of two images may match at several yaws. Each match is an answer, and leaves the yaw open by multiples of
-    90 deg: branch k of an answer is Rz(k 90 deg) R_vehicle_drone where the vehicle is level.
+    The lines of two images may match at several yaws. Each match leaves the yaw open by multiples of 90 deg: branch k of
+    a match is Rz(k 90 deg) R_vehicle_drone where the vehicle is level.
     """
 
-    answers: Annotated[NDArray[np.float64], Shape("n", 3, 3)]  # R_vehicle_drone, most probable first; empty: none
+    rotations: Annotated[NDArray[np.float64], Shape("n", 3, 3)]  # R_vehicle_drone, most probable first; empty: none
     covariances_rad2: Annotated[NDArray[np.float64], Shape("n", 3, 3)]  # of phi in R exp(phi), drone axes
-    probabilities: PerPointF64  # (n,) that an answer is right, on any branch; 1 - sum: that none is
-    branch_probability: Annotated[NDArray[np.float64], Shape(4)]  # of branch k of the first answer
+    probabilities: PerPointF64  # (n,) that a match is right, on any branch; 1 - sum: that none is
+    branch_probability: Annotated[NDArray[np.float64], Shape(4)]  # of branch k of the first match
     state: BranchState
     switches: int  # changes of the published branch since the start; each one is a jump
-    reason: str  # what the answers rest on, or why there is none
+    reason: str  # what the matches rest on, or why there is none
 
     @property
     def R_vehicle_drone(self) -> Mat3 | None:
-        """Branch 0 of the most probable answer; None: no answer."""
-        return self.answers[0] if len(self.answers) else None
+        """Branch 0 of the most probable match; None: no match."""
+        return self.rotations[0] if len(self.rotations) else None
 
     @property
     def covariance_rad2(self) -> Mat3 | None:
-        """Covariance of the most probable answer; None: no answer."""
-        return self.covariances_rad2[0] if len(self.answers) else None
+        """Covariance of the most probable match; None: no match."""
+        return self.covariances_rad2[0] if len(self.rotations) else None
 
     @staticmethod
     def one(
@@ -84,10 +84,10 @@ class RelativeRotation(Message):
         switches: int,
         reason: str,
     ) -> RelativeRotation:
-        """A message with a single answer."""
+        """A message with a single match."""
         return RelativeRotation(
             stamp_ns=stamp_ns,
-            answers=R_vehicle_drone[None],
+            rotations=R_vehicle_drone[None],
             covariances_rad2=covariance_rad2[None],
             probabilities=branch_probability.sum(keepdims=True),
             branch_probability=branch_probability,
@@ -98,10 +98,10 @@ class RelativeRotation(Message):
 
     @staticmethod
     def none(stamp_ns: int, reason: str, switches: int = 0) -> RelativeRotation:
-        """A message without an answer, with the reason."""
+        """A message without a match, with the reason."""
         return RelativeRotation(
             stamp_ns=stamp_ns,
-            answers=np.zeros((0, 3, 3)),
+            rotations=np.zeros((0, 3, 3)),
             covariances_rad2=np.zeros((0, 3, 3)),
             probabilities=np.zeros(0),
             branch_probability=np.zeros(4),

@@ -15,7 +15,7 @@ from stages.align.refine import Tolerances, refine, street_directions
 from stages.align.spectra import level_lines, overlap, peaks, spectrum
 from stages.geometry.frames import rotation_z
 from stages.heading.inertial_bank import start
-from stages.heading.rotation_answers import Answers, add_answers
+from stages.heading.rotation_matches import RotationMatches, add_matches
 from stages.messages import CameraMount
 from tests.stages.align.made_lines import ATLANTA, MANHATTAN, MS, seen, turned
 
@@ -72,19 +72,19 @@ def test_refinement(benchmark, name):
     benchmark(refine, *lines, street_directions(a, b, yaw), yaw, ALLOWED)
 
 
-@pytest.mark.parametrize("answers", [1, 3])
-def test_the_answers_of_a_pair_in_the_bank(benchmark, answers):
-    yaws = np.radians([10.0, 45.0, 70.0])[:answers]
-    made = Answers(
+@pytest.mark.parametrize("matches", [1, 3])
+def test_the_matches_of_a_pair_in_the_bank(benchmark, matches):
+    yaws = np.radians([10.0, 45.0, 70.0])[:matches]
+    made = RotationMatches(
         np.array([rotation_z(yaw) for yaw in yaws]),
-        np.tile(3e-5 * np.eye(3), (answers, 1, 1)),
-        np.full(answers, 0.9 / answers),
+        np.tile(3e-5 * np.eye(3), (matches, 1, 1)),
+        np.full(matches, 0.9 / matches),
         np.eye(3),
     )
 
     def bank():
         one = start(np.zeros(3), 0.01 * np.eye(3), None, np.array([0.0, 0.0, 1.0]))
-        add_answers(one, made, 1.0)
+        add_matches(one, made, 1.0)
         return (one, made, 0.1), {}
 
-    benchmark.pedantic(add_answers, setup=bank, rounds=200)
+    benchmark.pedantic(add_matches, setup=bank, rounds=200)

@@ -1,10 +1,10 @@
-"""Rotation between an up- and a down-looking fisheye rendered from real panoramas: answers, errors, stated probability.
+"""Rotation between an up- and a down-looking fisheye rendered from real panoramas: matches, errors, stated probability.
 
     GRD_RENDERS=40 python -m pytest tests/benchmarks/bench_align_panoramas.py -s
 
 GRD_RENDERS (10) pairs of each panorama, disturbed as in bench_vp_panoramas.py; both cameras are at the panorama's
-place. An answer is right when it is less than 2 deg off on one of its branches. The prior of 8 deg stands for a heading
-by the drone's motion: of the answers, the most probable one that agrees with it is accepted. About 0.7 s a pair.
+place. A match is right when it is less than 2 deg off on one of its branches. The prior of 8 deg stands for a heading
+by the drone's motion: of the matches, the most probable one that agrees with it is accepted. About 0.7 s a pair.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from tests.stages.panoramas import FOLDER, LABELS, R_MOUNT_CAMERA, fisheye, rand
 COUNT, SEED = int(os.environ.get("GRD_RENDERS", "10")), int(os.environ.get("GRD_RENDERS_SEED", "0"))
 PRIOR_RAD, RIGHT_DEG, NS = math.radians(8.0), 2.0, 1_000_000_000
 HEAD = (
-    "| panorama | pairs | answered [%] | right among the answers [%] | first right [%] | stated P of the first, right, "
+    "| panorama | pairs | with a match [%] | right among the matches [%] | first right [%] | stated P of the first, right, "
     "wrong | wrong accepted with the prior | error, median, 95 % [deg] | within 3 sigma [%] |"
 )
 pytestmark = [
@@ -65,13 +65,13 @@ def test_the_rotation_between_renders_of_real_panoramas():
     print(f"\n{HEAD}\n{'| --- ' * 9}|")  # noqa: T201
     wrong_accepted = 0
     for name in LABELS:
-        n = answered = right = first = wrong = inside = 0
+        n = matched = right = first = wrong = inside = 0
         stated: dict[bool, list[float]] = {True: [], False: []}
         errors: list[float] = []
         for R_true, R_world_vehicle, message, prior_rad in pairs(name):
             n += 1
-            answered += len(message.answers) > 0
-            e = [off(R_true, R_world_vehicle, R) for R in message.answers]
+            matched += len(message.rotations) > 0
+            e = [off(R_true, R_world_vehicle, R) for R in message.rotations]
             good = [math.degrees(np.linalg.norm(one)) < RIGHT_DEG for one in e]
             right += any(good)
             if good:
@@ -85,7 +85,7 @@ def test_the_rotation_between_renders_of_real_panoramas():
         wrong_accepted += wrong
         p = ", ".join(f"{np.mean(v):.2f}" if v else "-" for v in stated.values())
         print(  # noqa: T201
-            f"| {name} | {n} | {100 * answered / n:.0f} | {100 * right / n:.0f} | {100 * first / n:.0f} | {p} | {wrong} | "
+            f"| {name} | {n} | {100 * matched / n:.0f} | {100 * right / n:.0f} | {100 * first / n:.0f} | {p} | {wrong} | "
             f"{np.median(errors):.2f}, {np.quantile(errors, 0.95):.2f} | {100 * inside / max(len(errors), 1):.0f} |"
         )
         assert right >= 0.5 * n

@@ -21,9 +21,9 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from stages.align import JointAlign
+from stages.align.joint_align import JointAlignSettings
+from stages.align.pairing import Pairing
 from stages.align.spectra import level_lines, overlap, peaks, quarter_difference, spectrum
-from stages.messages import CameraMount, VanishingDirections
 from tests.stages.fuse.flown import RecordedFlight, recorded_inputs
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
@@ -67,15 +67,15 @@ def test_errors_of_lidar_positions():
 
 def matches(flown: RecordedFlight) -> list[tuple[np.ndarray, int]]:
     """For each pair of images: likeness of each match, and which is right; -1: none."""
-    stage, out = JointAlign(), []
-    seen: dict[CameraMount, dict[int, VanishingDirections]] = {mount: {} for mount in CameraMount}
+    settings, out = JointAlignSettings(), []
+    pairing, pairs = Pairing(round(1e9 * settings.max_apart_s)), []
     for _, port, message in flown.events:
         if port in ("vehicle", "drone"):
-            seen[message.camera_mount][message.stamp_ns] = message
-    for stamp_ns in sorted(seen[CameraMount.VEHICLE].keys() & seen[CameraMount.DRONE].keys()):
-        lines = [level_lines(seen[mount][stamp_ns], STRAIGHT_RAD) for mount in (CameraMount.VEHICLE, CameraMount.DRONE)]
-        true = flown.truth(stamp_ns)
-        if true is None or any(one is None or len(one.weight) < stage.settings.min_lines for one in lines):
+            pairs += pairing.vehicle(message) if port == "vehicle" else pairing.drone(message)
+    for pair in pairs:
+        lines = [None if seen is None else level_lines(seen, STRAIGHT_RAD) for seen in pair]
+        true = flown.truth(pair[1].stamp_ns)
+        if true is None or any(one is None or len(one.weight) < settings.min_lines for one in lines):
             continue
         found = peaks(overlap(*(spectrum(one) for one in lines)), APART_RAD)
         level = lines[0].R_carrier_level.T @ true[0] @ lines[1].R_carrier_level

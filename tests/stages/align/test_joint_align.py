@@ -55,13 +55,13 @@ def test_one_pair_gives_the_rotation_modulo_90_deg(streets):
     assert np.all(np.linalg.eigvalsh(output.covariance_rad2) > 0)
 
 
-def test_a_street_that_may_be_either_of_two_gives_both_answers():
+def test_a_street_that_may_be_either_of_two_gives_both_matches():
     """The vehicle's only street may be either of the drone's: 0 and 34 deg."""
     drone = seen(CameraMount.DRONE, turned(0, 0, 10), ATLANTA)
     output = pair(seen(CameraMount.VEHICLE, np.eye(3), (34.0, 124.0)), drone)
     check_arrays(output)
-    right = [k for k, R in enumerate(output.answers) if off_deg(turned(0, 0, 10), R) < 0.6]
-    wrong = [k for k, R in enumerate(output.answers) if off_deg(turned(0, 0, 10 + 34), R) < 0.6]
+    right = [k for k, R in enumerate(output.rotations) if off_deg(turned(0, 0, 10), R) < 0.6]
+    wrong = [k for k, R in enumerate(output.rotations) if off_deg(turned(0, 0, 10 + 34), R) < 0.6]
     assert len(right) == len(wrong) == 1
     assert output.probabilities[right + wrong].min() > 0.3
     assert output.probabilities.sum() < 1.0
@@ -76,14 +76,14 @@ def test_the_tilt_covariance_includes_errors_of_mount_and_lens():
     squares = []
     for seed in range(150):
         off_v, off_d = exp_rotation(rng.normal(0, off_rad)), exp_rotation(rng.normal(0, off_rad))
-        answer = pair(
+        match = pair(
             seen(CameraMount.VEHICLE, R_vehicle @ off_v, ATLANTA, seed=seed),
             seen(CameraMount.DRONE, R_drone @ off_d, ATLANTA, seed=seed),
             tilt_sigma_deg=0.07,
         )
-        branches = (turned(0, 0, 25 + quarter).T @ answer.R_vehicle_drone for quarter in (0, 90, 180, 270))
+        branches = (turned(0, 0, 25 + quarter).T @ match.R_vehicle_drone for quarter in (0, 90, 180, 270))
         phi = min((log_rotation(np.ascontiguousarray(off)) for off in branches), key=np.linalg.norm)
-        squares.append(phi[:2] @ np.linalg.solve(answer.covariance_rad2[:2, :2], phi[:2]))
+        squares.append(phi[:2] @ np.linalg.solve(match.covariance_rad2[:2, :2], phi[:2]))
     assert 0.7 < np.mean(squares) / 2 < 1.3
     assert np.mean(np.array(squares) < 5.99) > 0.9
 
@@ -98,14 +98,14 @@ def test_images_without_structure_give_no_rotation_and_the_reason():
     check_arrays(output)
 
 
-def test_lines_in_all_directions_leave_a_high_probability_of_no_right_answer():
+def test_lines_in_all_directions_leave_a_high_probability_of_no_right_match():
     rng = np.random.default_rng(0)
     angles, others = (tuple(rng.uniform(0, 180, 25).tolist()) for _ in range(2))
     output = pair(
         seen(CameraMount.VEHICLE, np.eye(3), angles, per_direction=2),
         seen(CameraMount.DRONE, np.eye(3), others, per_direction=2),
     )
-    assert not len(output.answers) or output.probabilities[0] < 0.6
+    assert not len(output.rotations) or output.probabilities[0] < 0.6
 
 
 def test_the_rotation_is_that_at_the_time_of_the_drone_s_image():

@@ -100,13 +100,13 @@ def test_a_drone_that_is_found_again_far_away_needs_evidence_for_its_heading():
 
 @pytest.mark.parametrize("off_deg", [15.0, 25.0, 44.0])
 def test_a_street_that_both_cameras_always_match_wrongly_does_not_reach_the_output(off_deg):
-    """Every image has one answer, stated as 96 % probable, that is off by the same angle."""
+    """Every image has one match, stated as 96 % probable, that is off by the same angle."""
     made = ImuFlight(kind="fast", seed=6, until_s=16.0, rotations=True, images=True)
 
     def skewed(events):
         for at_ns, port, m in events:
             if port == "rotation":
-                m = dataclasses.replace(m, answers=rotation_z(math.radians(off_deg)) @ m.answers)
+                m = dataclasses.replace(m, rotations=rotation_z(math.radians(off_deg)) @ m.rotations)
             yield at_ns, port, m
 
     flown = fly(made, fault=skewed)

@@ -1,4 +1,4 @@
-"""Several answers of both cameras as one measurement: of the bank of yaw hypotheses, and of a decided heading."""
+"""Several matches of both cameras as one measurement: of the bank of yaw hypotheses, and of a decided heading."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from stages.heading.imu_buffer import ImuBuffer
 from stages.heading.inertial_bank import InertialBank, joined, start
 from stages.heading.inertial_heading import DISAGREE, InertialHeading
 from stages.heading.inertial_state import THETA, InertialState
-from stages.heading.rotation_answers import Answers, add_answers, combine
+from stages.heading.rotation_matches import RotationMatches, add_matches, combine
 from stages.kernels.geometry.so3 import exp_rotation
 
 UP = np.array([0.0, 0.0, 1.0])
 QUARTER = math.pi / 2
 
 
-def answers(*yaws_deg: float, p=(0.9,), sigma_deg=0.3, tilt_deg=0.0) -> Answers:
+def matches(*yaws_deg: float, p=(0.9,), sigma_deg=0.3, tilt_deg=0.0) -> RotationMatches:
     R = np.array([rotation_z(math.radians(yaw)) @ exp_rotation(np.radians([tilt_deg, 0, 0])) for yaw in yaws_deg])
-    return Answers(R, np.tile(math.radians(sigma_deg) ** 2 * np.eye(3), (len(R), 1, 1)), np.array(p), np.eye(3))
+    return RotationMatches(R, np.tile(math.radians(sigma_deg) ** 2 * np.eye(3), (len(R), 1, 1)), np.array(p), np.eye(3))
 
 
 def any_yaw() -> InertialBank:
@@ -41,9 +41,9 @@ def decided(yaw_deg=0.0, sigma_deg=3.0) -> InertialState:
     return InertialState(rotation_z(math.radians(yaw_deg))[None], *np.zeros((2, 1, 3)), np.zeros((1, 6)), P)
 
 
-def test_one_answer_leaves_four_equally_probable_branches_and_the_case_that_it_is_wrong():
+def test_one_match_leaves_four_equally_probable_branches_and_the_case_that_it_is_wrong():
     bank = any_yaw()
-    right = add_answers(bank, answers(20.0), 1.0)
+    right = add_matches(bank, matches(20.0), 1.0)
     assert right == pytest.approx(0.9, abs=0.05)
     assert near(bank, 20.0) == pytest.approx(0.9, abs=0.05)
     for k in range(4):
@@ -52,45 +52,45 @@ def test_one_answer_leaves_four_equally_probable_branches_and_the_case_that_it_i
         assert bank.weight[narrow & (off < 0.05)].sum() == pytest.approx(0.225, abs=0.02)
 
 
-def test_two_answers_share_the_probability_as_stated():
+def test_two_matches_share_the_probability_as_stated():
     bank = any_yaw()
-    add_answers(bank, answers(20.0, 54.0, p=(0.6, 0.3)), 1.0)
+    add_matches(bank, matches(20.0, 54.0, p=(0.6, 0.3)), 1.0)
     assert near(bank, 20.0) == pytest.approx(0.6, abs=0.05)
     assert near(bank, 54.0) == pytest.approx(0.3, abs=0.05)
 
 
-def test_images_that_repeat_the_same_answer_do_not_make_it_more_probable():
+def test_images_that_repeat_the_same_match_do_not_make_it_more_probable():
     """A wrong match repeats itself in all images of a street."""
     bank = any_yaw()
-    add_answers(bank, answers(20.0), 1.0)
+    add_matches(bank, matches(20.0), 1.0)
     for _ in range(50):
-        add_answers(bank, answers(20.0), 0.1)
+        add_matches(bank, matches(20.0), 0.1)
     assert near(bank, 20.0) == pytest.approx(0.9, abs=0.05)
     assert bank.weight[bank.tied].sum() == pytest.approx(0.9, abs=0.05)
     assert np.sqrt(bank.state.yaw_variance_rad2[~bank.tied]).min() > math.radians(10)  # the free ones use no image
 
 
-def test_an_answer_that_returns_more_often_wins_among_the_tied_hypotheses():
+def test_a_match_that_returns_more_often_wins_among_the_tied_hypotheses():
     bank = any_yaw()
-    add_answers(bank, answers(20.0, 54.0, p=(0.45, 0.45)), 1.0)
+    add_matches(bank, matches(20.0, 54.0, p=(0.45, 0.45)), 1.0)
     for _ in range(20):
-        add_answers(bank, answers(54.0), 0.2)
+        add_matches(bank, matches(54.0), 0.2)
     assert near(bank, 54.0) > 5 * near(bank, 20.0)
     assert bank.weight[bank.tied].sum() == pytest.approx(0.9, abs=0.05)
 
 
-def test_answers_that_later_images_contradict_leave_the_free_hypotheses_alone():
+def test_matches_that_later_images_contradict_leave_the_free_hypotheses_alone():
     heading = InertialHeading(ImuBuffer())
     heading.start(0, np.zeros(3), 0.01 * np.eye(3), None, UP)
-    heading.add_rotation(0, answers(20.0), 1.0)
+    heading.add_rotation(0, matches(20.0), 1.0)
     for _ in range(DISAGREE - 1):
-        heading.add_rotation(0, answers(60.0), 0.1)
+        heading.add_rotation(0, matches(60.0), 0.1)
     assert heading.bank is not None
     assert heading.bank.tied.any()
-    heading.add_rotation(0, answers(60.0), 0.1)
+    heading.add_rotation(0, matches(60.0), 0.1)
     assert not heading.bank.tied.any()
     assert near(heading.bank, 20.0) == near(heading.bank, 60.0) == 0.0
-    heading.add_rotation(0, answers(60.0), 0.1)
+    heading.add_rotation(0, matches(60.0), 0.1)
     assert near(heading.bank, 60.0) == pytest.approx(0.9, abs=0.05)
 
 
@@ -109,25 +109,25 @@ def test_a_street_15_deg_beside_that_of_the_cameras_keeps_the_heading_undecided(
     assert near_probability[False] > 0.999
 
 
-def test_an_answer_with_another_tilt_is_not_used():
+def test_a_match_with_another_tilt_is_not_used():
     bank = any_yaw()
-    assert add_answers(bank, answers(20.0, tilt_deg=25.0), 1.0) == 0.0
+    assert add_matches(bank, matches(20.0, tilt_deg=25.0), 1.0) == 0.0
     assert near(bank, 20.0) == 0.0
 
 
-def test_a_decided_heading_takes_the_answer_that_agrees_and_ignores_others():
-    one = combine(decided(1.0), answers(34.0, 0.0 + 90, p=(0.7, 0.25)))
+def test_a_decided_heading_takes_the_match_that_agrees_and_ignores_others():
+    one = combine(decided(1.0), matches(34.0, 0.0 + 90, p=(0.7, 0.25)))
     assert one.R_map_drone is not None
     assert math.degrees(math.atan2(one.R_map_drone[1, 0], one.R_map_drone[0, 0])) == pytest.approx(0.0, abs=0.2)
 
 
-def test_two_answers_that_both_agree_have_a_covariance_that_covers_both():
-    one = combine(decided(0.0, 6.0), answers(-6.0, 6.0, p=(0.45, 0.45)))
+def test_two_matches_that_both_agree_have_a_covariance_that_covers_both():
+    one = combine(decided(0.0, 6.0), matches(-6.0, 6.0, p=(0.45, 0.45)))
     assert one.R_map_drone is not None
     assert math.degrees(math.sqrt(one.spread_rad2[2, 2])) > 5.5
 
 
-def test_an_answer_that_contradicts_a_decided_heading_is_rejected():
-    one = combine(decided(0.0, 1.0), answers(20.0))
+def test_a_match_that_contradicts_a_decided_heading_is_rejected():
+    one = combine(decided(0.0, 1.0), matches(20.0))
     assert one.R_map_drone is None
     assert math.degrees(abs(one.residual_rad[2])) == pytest.approx(20.0, abs=0.1)

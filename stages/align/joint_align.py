@@ -107,7 +107,11 @@ class JointAlign(Stage[JointAlignSettings]):
             if probability < LEAST_PROBABILITY:
                 continue
             one = refine(vehicle, drone, street_directions(a, b, top.yaw_rad), top.yaw_rad, self._tolerances)
-            if one.directions and min(one.vehicle_lines, one.drone_lines) >= self.settings.min_lines:
+            if (
+                one is not None
+                and one.directions
+                and min(one.vehicle_lines, one.drone_lines) >= self.settings.min_lines
+            ):
                 found.append((one, probability))
         return found
 

@@ -159,8 +159,11 @@ def refine(
     directions: Array64,
     yaw_rad: float,
     allowed: Tolerances,
-) -> Refined:
-    """Gauss-Newton refinement, started at `yaw_rad` and `directions` (K,) of the spectra."""
+) -> Refined | None:
+    """Gauss-Newton refinement, started at `yaw_rad` and `directions` (K,) of the spectra.
+
+    None: the cameras have neither a direction in common nor two at right angles: the lines do not determine the yaw.
+    """
     K = len(directions)
     unknowns = TILTS_AND_YAW + 3 * K
     street, own = TILTS_AND_YAW, (TILTS_AND_YAW + K, TILTS_AND_YAW + 2 * K)
@@ -175,6 +178,10 @@ def refine(
         for j in range(i)
         if abs(abs(half_turn_difference(a[i] - a[j])) - math.pi / 2) < SQUARE_RAD
     ]
+    own_k = [set(camera.k.tolist()) for camera in cameras]
+    shared = own_k[0] & own_k[1]
+    if not shared and not any({i, j} & own_k[0] and {i, j} & own_k[1] for i, j in squares):
+        return None
     ties = np.zeros((2 * K + len(squares) + 4, unknowns))
     seen = np.arange(K)
     for c, camera in enumerate(cameras):
@@ -215,13 +222,12 @@ def refine(
         a = a + step[street : street + K]
     covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)[:TILTS_AND_YAW, :TILTS_AND_YAW]
     covariance[range(4), range(4)] += allowed.tilt_rad**2  # shared by all lines, so it does not average out
-    both = sum(1 for k in range(K) if all(np.any(camera.k == k) for camera in cameras))
     return Refined(
         R_vehicle_level=cameras[0].R,
         R_drone_level=cameras[1].R,
         yaw_rad=yaw,
         covariance=covariance,
-        directions=both,
+        directions=len(shared),
         vehicle_lines=round(cameras[0].effective_lines),
         drone_lines=round(cameras[1].effective_lines),
     )

@@ -34,7 +34,7 @@ BROAD_RAD = math.radians(4.0)  # lines with a larger azimuth sigma are not used
 LONG_RAD = 0.5  # bound of the weight of a line
 NEAR_BINS = 4  # directions this near to each other are the same
 DIRECTION_SHARE = 0.04  # share of all lines from which a direction has full weight
-LIKENESS_WEIGHT, NONE_LIKENESS = 9.0, 0.48  # see match_probabilities
+LIKENESS_WEIGHT, NONE_LIKENESS = 6.3, 0.31  # see match_probabilities
 LEAST_NONE = 0.02  # probability that no match is right, at least
 
 
@@ -156,8 +156,8 @@ def peaks(correlation: Array64, separation_rad: float) -> list[Peak]:
 def match_probabilities(found: list[Peak]) -> Array64:
     """Probability (n,) that each match is the right one; 1 - sum: that none is.
 
-    A softmax of the likenesses and of NONE_LIKENESS. Both constants maximise the likelihood of the true matches of 820
-    pairs of images of ten simulated flights in five kinds of scenes.
+    A softmax of the likenesses and of NONE_LIKENESS. Both constants maximise the likelihood of the true matches of 410
+    pairs of images of ten simulated flights in five kinds of scenes (tests/benchmarks/bench_measured_errors.py).
     """
     score = LIKENESS_WEIGHT * np.array([*(peak.likeness for peak in found), NONE_LIKENESS])
     share = np.exp(score - score.max())

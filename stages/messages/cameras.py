@@ -52,8 +52,8 @@ class BranchState(enum.Enum):
 class RelativeRotation(Message):
     """R_vehicle_drone by both cameras; stamp_ns is the images'. P IV.
 
-    The lines of two images may match at several yaws. Each match leaves the yaw open by multiples of 90 deg: branch k of
-    a match is Rz(k 90 deg) R_vehicle_drone where the vehicle is level.
+    The lines of two images may match at several yaws. Each match leaves the yaw open by multiples of 90 deg: branch k
+    of a match is Rz(k 90 deg) R_vehicle_drone where the vehicle is level.
     """
 
     rotations: Annotated[NDArray[np.float64], Shape("n", 3, 3)]  # R_vehicle_drone, most probable first; empty: none

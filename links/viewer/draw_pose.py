@@ -52,6 +52,7 @@ TRAVEL = 1.4  # length of the direction of travel, in radii of the sphere
 AXES = ["x forward", "y left", "z up"]
 WARNING_STATES = (PoseState.LOST, PoseState.AMBIGUOUS, PoseState.COASTING)
 RATIOS = ["velocity", "horizontal position", "height", "compass"]
+MATCHES = ["first match", "second match", "third match", "fourth match", "none of them"]
 BRANCHES = ["yaw 0 deg", "yaw 90 deg", "yaw 180 deg", "yaw 270 deg", "none of them"]
 BRANCH_COLOURS = np.array(
     [colours.GOOD, colours.COASTING, colours.CANDIDATE, colours.VERTICAL, colours.BAD], dtype=np.uint32
@@ -201,11 +202,13 @@ def heading_estimate(message: HeadingEstimate, name: str, scene: ViewerScene) ->
 
 
 def relative_rotation(message: RelativeRotation, name: str, scene: ViewerScene) -> Entities:
-    """Yaw branch probabilities, state, branch switches, angles with sigmas; the drone's axes at its fix."""
+    """Probabilities of yaw branches or matches, state, switches, angles with sigmas; the drone's axes at its fix."""
     state = message.state.name
-    probability = message.branch_probability
-    percent = 100.0 * np.append(probability, max(0.0, 1.0 - probability.sum()))
-    yield plot(f"plots/branch/{name}", percent, BRANCHES, BRANCH_COLOURS)
+    is_open = message.state is BranchState.OPEN
+    probability = np.append(message.probabilities, np.zeros(4))[:4] if is_open else message.branch_probability
+    all_of_them = message.probabilities.sum() if is_open else probability.sum()
+    percent = 100.0 * np.append(probability, max(0.0, 1.0 - all_of_them))
+    yield plot(f"plots/branch/{name}", percent, MATCHES if is_open else BRANCHES, BRANCH_COLOURS)
     yield from state_change(state_path(name), state, scene)
     yield plot(f"plots/other/{name}/switches", [message.switches], ["branch switches"])
     if scene.changed(f"switches/{name}", str(message.switches)) and message.switches:

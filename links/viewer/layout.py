@@ -188,7 +188,7 @@ def _camera_views(vision: Vision) -> Rows:
             (
                 13,
                 _curves(
-                    "Yaw [%]: branch 0 deg green, 90 orange, 180 violet, 270 blue, none red; "
+                    "Yaw [%]: matches or branches green, orange, violet, blue, none red; "
                     "within 20 deg of the best grey",
                     "/plots/branch/**",
                 ),

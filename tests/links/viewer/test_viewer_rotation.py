@@ -37,6 +37,17 @@ def test_the_four_branches_and_none_of_them_are_curves_that_sum_to_all():
     assert scalars(drawn(certain, NAME)[f"plots/branch/{NAME}"])[4] == 0.0
 
 
+def test_while_the_branch_is_open_the_curves_are_the_matches():
+    two = rotation(
+        state=BranchState.OPEN,
+        rotations=np.tile(np.eye(3), (2, 1, 1)),
+        covariances_rad2=np.tile(1e-4 * np.eye(3), (2, 1, 1)),
+        probabilities=np.array([0.6, 0.3]),
+    )
+    np.testing.assert_allclose(scalars(drawn(two, NAME)[f"plots/branch/{NAME}"]), [60.0, 30.0, 0.0, 0.0, 10.0])
+    assert "OPEN, 60.0 %" in document(drawn(two, NAME)["status"])
+
+
 @pytest.mark.parametrize("rpy", [(0.0, 0.0, 0.0), (10.0, -20.0, 170.0), (-179.0, 80.0, -90.0)])
 def test_angles_round_trip_through_a_rotation(rpy):
     np.testing.assert_allclose(rpy_deg(rotation_from_rpy_deg(rpy)), rpy, atol=1e-9)

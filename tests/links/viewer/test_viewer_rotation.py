@@ -159,7 +159,7 @@ def test_camera_views_exist_only_when_the_graph_has_their_outputs():
     assert len(added) == 8, "seven views, and the tab"
     assert names(Vision(rotation=True)) - without == {
         "Rotation",
-        "Yaw [%]: branch 0 deg green, 90 orange, 180 violet, 270 blue, none red; within 20 deg of the best grey",
+        "Yaw [%]: matches or branches green, orange, violet, blue, none red; within 20 deg of the best grey",
         "Rotation in the vehicle frame [deg]: roll red, pitch green, yaw blue",
         "Sigma of the rotation [deg], about x red, y green, z blue",
     }

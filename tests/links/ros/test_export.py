@@ -234,6 +234,19 @@ def test_an_exported_run_has_its_poses_transforms_and_diagnostics(tmp_path: Path
     assert covariance[5, 5] == pytest.approx(np.pi**2)
 
 
+def test_a_pose_whose_rotation_is_unknown_has_no_transform(tmp_path: Path):
+    run = run_folder(tmp_path)
+    table = run / "pose_covariance.csv"
+    table.write_text(table.read_text().replace("COASTING,0,1,", "POSITION_ONLY,0,0,").replace("0.01", "9.8696044"))
+    bag = read(export(run, tmp_path / "bag").path)
+    assert [time_ns for time_ns, _ in bag["/tf"]] == [1_700_000_001_100_000_001]
+    for topic in ("/grd/pose", "/grd/odometry"):
+        assert len(bag[topic]) == 2
+        pose = bag[topic][1][1].pose
+        assert (pose.pose.orientation.x, pose.pose.orientation.w) == (0.0, 1.0)
+        assert pose.covariance[21] == pytest.approx(np.pi**2)
+
+
 def test_a_run_is_exported_with_its_recording(tmp_path: Path):
     path, _, _ = small(tmp_path, 0.3)
     topics = read(export(run_folder(tmp_path), tmp_path / "bag", recording=path).path)

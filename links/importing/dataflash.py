@@ -37,11 +37,11 @@ class DataflashLog(ImportedFile):
 
     def __init__(self, source: Path) -> None:
         self._source = source
-        self._maker = FrameMaker(ARDUPILOT)
         self._rates: tuple[float, ...] = (0.0, 0.0, 0.0)
         self._percent = 0.0
         self._ekf: str | None = None  # the message that is used: of the first EKF that is in the log
         self._unused: Counter[str] = Counter()
+        self._maker = FrameMaker(ARDUPILOT, self._unused)
         self._noise = io.StringIO()  # pymavlink prints what it skips
 
     def records(self) -> Iterator[Record]:

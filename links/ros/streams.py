@@ -57,10 +57,10 @@ def stamp_ns(message: BagMessage, use: TopicUse, stamp: Any | None = None) -> in
     if stamp is None or use.stamp == "arrival":
         return message.time_ns
     at_ns = time_ns(stamp)
-    apart_s = abs(at_ns - message.time_ns) * 1e-9
-    if apart_s > EPOCH_LIMIT_S:
+    difference_s = abs(at_ns - message.time_ns) * 1e-9
+    if difference_s > EPOCH_LIMIT_S:
         raise LinkError(
-            f"{message.topic}: its header's clock is {apart_s:.0f} s from the bag's, another epoch: "
+            f"{message.topic}: its header's clock is {difference_s:.0f} s from the bag's, another epoch: "
             "set `stamp: arrival` for this topic in the mapping file, to use the time of recording"
         )
     return at_ns

@@ -292,7 +292,10 @@ def test_a_ulog_that_is_damaged_or_empty_is_refused(tmp_path: Path):
     for content, says in (
         (whole[:20], "no IMU, attitude, position or GNSS|cannot be read"),
         (ulog({"other": ("uint64_t timestamp;float x;", [(1, 1.0)])}), "no IMU, attitude, position or GNSS"),
-        (ulog({"sensor_combined": ("uint64_t timestamp;float x;", [(1, 1.0)])}), "without the fields of a PX4 log"),
+        (
+            ulog({"sensor_combined": ("uint64_t timestamp;float x;", [(1, 1.0)])}),
+            r"topic sensor_combined has no field 'gyro_rad\[0\]': .* import the telemetry log",
+        ),
     ):
         (tmp_path / "a.ulg").write_bytes(content)
         with pytest.raises(LinkError, match=says):
@@ -308,6 +311,17 @@ def test_a_ulog_that_is_damaged_or_empty_is_refused(tmp_path: Path):
             import_file(tmp_path / "a.ulg").path.unlink()
         except LinkError:
             assert not (tmp_path / "a.mcap").exists()
+
+
+@pytest.mark.parametrize("latitude_deg", [math.nan, 1e6, math.inf])
+def test_damaged_values_of_a_ulog_are_counted_and_the_rest_is_imported(tmp_path: Path, latitude_deg: float):
+    pytest.importorskip("pyulog")
+    latitude = struct.pack("<d", 35.7)
+    content = px4_flight(new=True).replace(latitude, struct.pack("<d", latitude_deg), 1)
+    report, messages, frames = imported(tmp_path, "flight.ulg", content)
+    assert report.skipped == {"values out of range": 1}
+    assert len(of(messages, DroneImu)) == 250
+    assert len([f for f in frames if f.get_type() == "GPS_RAW_INT"]) == 1
 
 
 def test_without_pyulog_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -22,6 +22,7 @@ from links.importing import import_file
 from links.importing.info import file_info
 from links.lidar import rig_unit
 from links.mavlink.autopilot import Autopilot
+from links.mavlink.transport.framing import parse_frame
 from links.recording import RecordingReader, decode_compressed_image
 from links.ros.mapping import BagMapping, TopicUse, read_mapping
 from links.vehicle_odometry.odometry import parse_pose
@@ -416,6 +417,21 @@ def test_mavros_topics_become_frames_that_the_autopilots_decoder_reads(tmp_path:
     assert_allclose(newest[DroneOdometry].velocity_drone_mps, [1.0, 2.0, 3.0], rtol=1e-6)
     last_ns = START_NS + 49 * 20_000_000
     assert abs(newest[DroneOdometry].stamp_ns - last_ns) < 2_000_000  # late by the least delay, 1 ms
+
+
+def test_damaged_values_of_mavros_are_counted_and_the_rest_is_imported(tmp_path: Path):
+    kinds = {"imu": "sensor_msgs/msg/Imu", "fix": "sensor_msgs/msg/NavSatFix"}
+    good = {"orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}}
+    values = [("imu", {**good, "angular_velocity": {"x": 1e300, "y": 0.0, "z": 0.0}}), ("imu", good)]
+    values += [("fix", {"latitude": 1e10, "longitude": 139.7}), ("fix", {"latitude": 35.7, "longitude": 139.7})]
+    entries: list[Entry] = [
+        (f"/mavros/{name}", kinds[name], START_NS + k * 10**7, {"header": header(START_NS + k * 10**7), **each})
+        for k, (name, each) in enumerate(values)
+    ]
+    report, records, _ = imported(tmp_path, write_bag(tmp_path / "bag", entries))
+    assert report.skipped == {"values out of range": 3}  # HIGHRES_IMU and ATTITUDE of the first, the first position
+    assert [parse_frame(r.data).get_type() for r in records] == ["HEARTBEAT", "HIGHRES_IMU", "ATTITUDE", "GPS_RAW_INT"]
+    assert [r.data[4] for r in records] == [0, 1, 2, 3]  # no sequence number is missing
 
 
 # ---- mapping

@@ -81,7 +81,8 @@ class RosbagFile(ImportedFile):
             return None
         if SERVO in (stream for stream, _ in self._by_topic.values()):
             raise LinkError(
-                f"{self._source}: its LiDAR is on a servo, and no bag says how: give its rig with --rig RIG.yaml"
+                f"{self._source}: its LiDAR is on a servo, and a bag does not contain its mount: give its rig with "
+                "--rig RIG.yaml"
             )
         rig = DEFAULT_RIG.format(model=self._model.form.profile.model)
         if self._made_unit is None:

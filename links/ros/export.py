@@ -1,7 +1,7 @@
 """A recording or a run as a ROS 2 bag: a folder with one MCAP file and metadata.yaml, as `ros2 bag` writes it.
 
 The folder appears when it is complete. Foxglove opens the MCAP file, `ros2 bag play` the folder; `grd import` gives the
-recording's packets, pictures and frames back byte for byte.
+recording's packets, images and frames back byte for byte.
 
 Source: ours; rosbags (https://ternaris.gitlab.io/rosbags), rosbag2 format version 9.
 """

@@ -206,7 +206,7 @@ def test_the_rigs_model_must_be_the_packets(tmp_path: Path):
 def test_a_lidar_on_a_servo_needs_its_rig(tmp_path: Path):
     joint: Entry = ("/joint_states", JOINTS, PACKETS[0].arrival_ns, {"name": ["a"], "position": [0.5]})
     bag = write_bag(tmp_path / "bag", [joint, *scans()])
-    assert "its LiDAR is on a servo" in refused(
+    assert "its LiDAR is on a servo, and a bag does not contain its mount: give its rig" in refused(
         bag,
         tmp_path,
         mapping=mapping(
@@ -220,6 +220,7 @@ def test_a_clock_of_another_epoch_is_an_error_and_the_times_of_recording_can_be_
     text = refused(bag, tmp_path)
     assert "1000000000 s from the bag's" in text
     assert "stamp: arrival" in text
+    assert "`grd info BAG --map FILE`" in text
     use = {"topic": "/velodyne_packets", "stamp": "arrival"}
     _, records, _ = imported(tmp_path, bag, mapping=mapping(lidar_packets=use))
     assert [r.data for r in records] == [r.data for r in PACKETS]
@@ -241,7 +242,10 @@ def test_a_joint_becomes_the_servo(tmp_path: Path):
         for k in range(3)
     ]
     bag = write_bag(tmp_path / "bag", entries)
-    assert "several joints (wheel, pan)" in refused(bag, tmp_path)
+    text = refused(bag, tmp_path)
+    assert "several joints (wheel, pan)" in text
+    assert "`grd info BAG --map FILE`" in text
+    assert "delete the line /servo/state" in text
     use = {"topic": "/joint_states", "joint": "tilt"}
     assert "no joint 'tilt'" in refused(bag, tmp_path, mapping=mapping(servo_state=use))
     _, records, _ = imported(tmp_path, bag, mapping=mapping(servo_state={**use, "joint": "pan"}), rig_yaml=RIG)
@@ -249,6 +253,16 @@ def test_a_joint_becomes_the_servo(tmp_path: Path):
     assert [r.arrival_ns - r.stamp_ns for r in records] == [1000] * 3
     assert_allclose([s["position_rad"] for s in states], [0.0, 0.1, 0.2])
     assert_allclose([s["velocity_radps"] for s in states], [0.0, 10.0, 10.0])
+
+
+@pytest.mark.parametrize(("names", "words"), [(["pan"], "the position of joint 'pan'"), ([], "no joint ()")])
+def test_a_joint_state_without_a_position_is_refused_with_advice(tmp_path: Path, names: list[str], words: str):
+    bag = write_bag(
+        tmp_path / "bag", [("/joint_states", JOINTS, START_NS, {"header": header(START_NS), "name": names})]
+    )
+    text = refused(bag, tmp_path, rig_yaml=RIG)
+    assert words in text
+    assert "mapping file" in text
 
 
 @pytest.mark.parametrize(
@@ -314,13 +328,16 @@ def test_a_compressed_image_is_kept_as_it_is_and_png_becomes_jpeg(tmp_path: Path
     assert decode_compressed_image(record.data).data == jpeg
     _, (record,), _ = imported(tmp_path, bag(png, "png"))
     assert decode_compressed_image(record.data).data.startswith(b"\xff\xd8\xff")
-    assert "JPEG and PNG are read" in refused(bag(b"theora", "theora"), tmp_path)
+    text = refused(bag(b"theora", "theora"), tmp_path)
+    assert "an image of format 'theora' is not read: convert the topic to JPEG or PNG, or remove it from" in text
 
 
 def test_an_image_that_cannot_be_read_is_refused(tmp_path: Path):
     values = {"header": header(START_NS), "height": 2, "width": 2, "encoding": "32FC1", "step": 8, "data": [0] * 16}
     entry: Entry = ("/roof/image", "sensor_msgs/msg/Image", START_NS, values)
-    assert "encoding '32FC1'" in refused(write_bag(tmp_path / "a", [entry]), tmp_path)
+    text = refused(write_bag(tmp_path / "a", [entry]), tmp_path)
+    assert "images of encoding '32FC1' are not read: convert the topic to one of mono8, " in text
+    assert "or remove it from the mapping file" in text
     wrong = values | {"encoding": "bgr8", "width": 4}
     assert "with rows of 8 bytes has 16" in refused(write_bag(tmp_path / "b", [(*entry[:3], wrong)]), tmp_path)
 
@@ -446,6 +463,7 @@ def test_the_guess_takes_what_names_and_types_say(tmp_path: Path):
         "/camera_up/compressed": image,
         "/drone/camera/compressed": image,
         "/odom": "nav_msgs/msg/Odometry",
+        "/mavros/global_position/local": "nav_msgs/msg/Odometry",  # by GNSS, not the autopilot's estimate
         "/mavros/local_position/odom": "nav_msgs/msg/Odometry",
         "/imu/data": imu,  # the vehicle's own
         "/mavros/imu/data": imu,

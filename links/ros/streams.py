@@ -100,8 +100,8 @@ def _joint(message: BagMessage, use: TopicUse) -> int:
     if joint not in names:
         wanted = "several joints" if joint is None and names else "no joint" if joint is None else f"no joint {joint!r}"
         raise LinkError(
-            f"{message.topic}: {wanted} ({', '.join(names)}): set `joint` of {SERVO} in the mapping file "
-            f"(`grd info BAG --map FILE` writes it), or delete the line {SERVO} if the LiDAR is on no servo"
+            f"{message.topic}: {wanted} ({', '.join(names) or 'it names none'}): set `joint` of {SERVO} in the "
+            f"mapping file (`grd info BAG --map FILE` writes it), or delete the line {SERVO} if there is no servo"
         )
     index = names.index(joint)
     if index >= len(message.value.position):

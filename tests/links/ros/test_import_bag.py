@@ -255,7 +255,9 @@ def test_a_joint_becomes_the_servo(tmp_path: Path):
     assert_allclose([s["velocity_radps"] for s in states], [0.0, 10.0, 10.0])
 
 
-@pytest.mark.parametrize(("names", "words"), [(["pan"], "the position of joint 'pan'"), ([], "no joint ()")])
+@pytest.mark.parametrize(
+    ("names", "words"), [(["pan"], "the position of joint 'pan'"), ([], "no joint (it names none)")]
+)
 def test_a_joint_state_without_a_position_is_refused_with_advice(tmp_path: Path, names: list[str], words: str):
     bag = write_bag(
         tmp_path / "bag", [("/joint_states", JOINTS, START_NS, {"header": header(START_NS), "name": names})]

@@ -136,6 +136,6 @@ def returns_of(packets: Iterable[LidarFirings], lasers_of_model: int, step: int)
 
 
 def checked_rig(text: str, where: str) -> tuple[dict[str, object], RigLidar]:
-    """A rig file's tree and its LiDAR. LinkError says what is wrong with it."""
+    """A rig file's tree and its LiDAR. Raises LinkError with the reason."""
     unit = rig_unit(text, where)
     return yaml_values(text), unit

@@ -23,7 +23,10 @@ COMMANDS = {
     "graph": ("graphs:graph", "Draw the graph of CONFIG."),
     "schema": ("graphs:schema", "Write the JSON Schema of the YAML files, for editors."),
     "import": ("files:import_recording", "Convert a capture, a telemetry log or a ROS bag to a recording."),
-    "info": ("links.importing.command:info", "Show what is in a file: kind, span, topics"),
+    "info": (
+        "links.importing.command:info",
+        "Show what is in a file: kind, span, topics, and what an import makes of them.",
+    ),
     "export": ("links.importing.command:export", "Write a recording or a run as a ROS 2 bag (MCAP)."),
     "recover": ("files:recover_recording", "Make a clean copy of a damaged recording."),
     "simulate": ("simulate:simulate_recording", "Make a recording of a simulated flight."),

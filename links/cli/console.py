@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import typer
@@ -123,6 +124,12 @@ def _progress_lines(label: str) -> Iterator[Callable[[float, float], None]]:
 def warn(text: str) -> None:
     """Print a warning on stderr."""
     err.print(f"warning: {text}", markup=False, style="yellow")
+
+
+def check_new(file: Path, option: str, *, overwrite: bool) -> None:
+    """LinkError when an output file exists and must not be overwritten; `option` names another file."""
+    if file.exists() and not overwrite:
+        raise LinkError(f"{file} exists already: give another name with {option}, or --overwrite")
 
 
 def show_table(table: Table) -> None:

@@ -15,7 +15,7 @@ from pydantic import ValidationError
 
 from flow.config.yaml_text import YamlTextError, yaml_values
 from flow.link import LinkError
-from links.cli.console import EXIT_FAILED, err, out, progress_bar, report_errors, warn
+from links.cli.console import EXIT_FAILED, check_new, err, out, progress_bar, report_errors, warn
 from stages.geometry.frames import LidarMount
 
 MAX_RIG_BYTES = 100_000
@@ -88,8 +88,7 @@ def _import_beams(file: Path, out_file: Path | None, overwrite: bool) -> None:
     """Write the model and the beams in a manufacturer's file as a rig file."""
     lidar = _lidar_of(file)
     target = out_file or file.with_suffix(".yaml")
-    if target.exists() and not overwrite:
-        raise LinkError(f"{target} exists already: give another name with -o, or --overwrite")
+    check_new(target, "-o", overwrite=overwrite)
     target.write_text(
         yaml.safe_dump({"rig": {"lidar": lidar}}, sort_keys=False, default_flow_style=None, width=120), encoding="utf-8"
     )

@@ -72,7 +72,7 @@ def run(
             metavar="CONFIG",
             callback=shipped_option,
             help="Then run this configuration, on its own recording or else on the same one, and print both runs "
-            "side by side.",
+            "side by side. --overlay and --set apply to the first CONFIG alone.",
         ),
     ] = None,
     view: View = False,

@@ -8,7 +8,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.table import Table
 from rich.text import Text
 
@@ -16,7 +15,7 @@ from flow.graph import Graph
 from flow.live.report import LiveReport
 from links.cli.console import out, show_table, warn
 from links.clock import Clock
-from links.runs.fused_poses import FusedPoses
+from links.runs.fused_poses import FusedPoses, rms
 from links.runs.request import RunResult
 from links.runs.results import FIX_FILE, POSE_FILE, SUMMARY_FILE, stamp_s
 from links.zenoh import Receiver, Sender
@@ -95,26 +94,24 @@ def truth_texts(run: RunResult) -> list[str]:
         distance_m = run.poses.distance_m
         text = (
             f"fused poses, errors against the truth: RMSE x/y/z {x:.3f} {y:.3f} {z:.3f} m, 3D "
-            f"{_rms(distance_m):.3f} m, largest {np.nanmax(distance_m):.2f} m; "
+            f"{rms(distance_m):.3f} m, largest {np.nanmax(distance_m):.2f} m; "
             f"inside the 95 % ellipsoid {100 * run.poses.inside_95:.0f} %"
         )
         angle_deg = np.degrees(run.poses.angle_rad)
         if np.isfinite(angle_deg).any():
-            text += f"; rotation RMSE {_rms(angle_deg):.2f} deg, largest {np.nanmax(angle_deg):.2f} deg"
+            text += f"; rotation RMSE {rms(angle_deg):.2f} deg, largest {np.nanmax(angle_deg):.2f} deg"
         texts.append(text)
     return texts
 
 
 def _first_full(run: RunResult) -> str:
     """When the whole pose was known for the first time, or why it never was."""
-    if run.poses is None or not run.poses.full.any():
-        return f"never FULL, at the end: {run.results.pose_reason}"
-    first_ns = int(run.poses.stamps_ns[run.poses.full][0])
-    return f"FULL after {(first_ns - run.report.first_ns) / 1e9:.1f} s"
-
-
-def _rms(values: NDArray[np.float64]) -> float:
-    return float(np.sqrt(np.nanmean(values**2)))
+    if run.poses is not None and run.poses.full.any():
+        first_ns = int(run.poses.stamps_ns[run.poses.full][0])
+        return f"FULL after {(first_ns - run.report.first_ns) / 1e9:.1f} s"
+    if run.counted_full:
+        return f"FULL, but {POSE_FILE} is cut off: the time and the errors are not known; was the disk full?"
+    return f"never FULL, at the end: {run.results.pose_reason}"
 
 
 def _pose_table(run: RunResult, poses: FusedPoses) -> Table:

@@ -12,7 +12,7 @@ import typer
 from rich.table import Table
 
 from flow.link import LinkError
-from links.cli.console import out, progress_bar, report_errors, show_table, warn
+from links.cli.console import check_new, out, progress_bar, report_errors, show_table, warn
 
 MAX_FACT_CHARACTERS = 200
 
@@ -35,8 +35,7 @@ def info(
     if mapping is not None:
         if found.mapping is None:
             raise LinkError(f"{file} is no ROS bag: only a bag has a mapping")
-        if mapping.exists() and not overwrite:
-            raise LinkError(f"{mapping} exists already: give another name with --map, or --overwrite")
+        check_new(mapping, "--map", overwrite=overwrite)
     for name, text in found.facts:
         short = text if len(text) <= MAX_FACT_CHARACTERS else f"{text[:MAX_FACT_CHARACTERS]} ..."
         out.print(f"{name}: {short}", markup=False)

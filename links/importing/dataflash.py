@@ -29,7 +29,24 @@ from links.mavlink.streams.imu_stamps import DELAY_NS
 FILTERED_NS = DELAY_NS["RAW_IMU"] - DELAY_NS["HIGHRES_IMU"]
 EKF = ("XKF1", "NKF1", "EKF1")  # EKF3, EKF2 and the first one's
 USED = ("IMU", "ATT", "GPS", "EV", "ARM", *EKF)
+MAX_LINE = 300  # characters of a warning
 _ARMED, _DISARMED = 10, 11  # EV
+
+
+class _FirstLine(io.TextIOBase):
+    """A text stream that keeps its first line and the number of lines."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.first = ""
+        self.lines = 0
+
+    def write(self, text: str, /) -> int:
+        """See TextIOBase."""
+        if self.lines == 0:
+            self.first = (self.first + text.partition("\n")[0])[:MAX_LINE]
+        self.lines += text.count("\n")
+        return len(text)
 
 
 class DataflashLog(ImportedFile):
@@ -37,12 +54,13 @@ class DataflashLog(ImportedFile):
 
     def __init__(self, source: Path) -> None:
         self._source = source
-        self._maker = FrameMaker(ARDUPILOT)
         self._rates: tuple[float, ...] = (0.0, 0.0, 0.0)
         self._percent = 0.0
         self._ekf: str | None = None  # the message that is used: of the first EKF that is in the log
         self._unused: Counter[str] = Counter()
-        self._noise = io.StringIO()  # pymavlink prints what it skips
+        self._maker = FrameMaker(ARDUPILOT, self._unused)
+        self._noise = _FirstLine()  # pymavlink prints what it skips
+        self._end: str | None = None  # why the log was not read to its end
 
     def records(self) -> Iterator[Record]:
         """See ImportedFile."""
@@ -72,7 +90,7 @@ class DataflashLog(ImportedFile):
                 self._percent = log.percent
                 yield message
         except Exception as error:  # noqa: BLE001
-            self._noise.write(f"ends at {log.percent:.0f} % of its bytes: {error}\n")
+            self._end = f"{self._source}: ends at {log.percent:.0f} % of its bytes: {error}: the rest is missing"
         finally:
             log.close()
 
@@ -86,9 +104,9 @@ class DataflashLog(ImportedFile):
 
     def warnings(self) -> list[str]:
         """See ImportedFile."""
-        lines = self._noise.getvalue().splitlines()
-        more = f" (and {len(lines) - 1} more)" if len(lines) > 1 else ""
-        return [f"{self._source}: {lines[0]}{more}"] if lines else []
+        more = f" (and {self._noise.lines - 1} more)" if self._noise.lines > 1 else ""
+        skipped = [f"{self._source}: {self._noise.first}{more}"] if self._noise.first else []
+        return skipped if self._end is None else [self._end, *skipped]
 
     def nothing_found(self) -> str:
         """See ImportedFile."""

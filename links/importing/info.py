@@ -59,7 +59,8 @@ def _recording(path: Path, info: FileInfo) -> None:
             except LinkError as error:
                 info.warnings.append(str(error))
         facts += [
-            ("rig, configuration", f"{_there(reader.rig_yaml)}, {_there(reader.config_yaml)}"),
+            ("rig", _there(reader.rig_yaml)),
+            ("configuration", _there(reader.config_yaml)),
             *((name, text) for name, text in reader.metadata.items()),
         ]
         seconds = (reader.end_ns - reader.start_ns) * 1e-9
@@ -149,18 +150,39 @@ def _run(path: Path, info: FileInfo) -> None:
     summary = path / "summary.json"
     values: dict[str, Any] = {}
     if summary.is_file():
-        values = json.loads(summary.read_text(encoding="utf-8"))
+        values = _summary(summary)
     else:
         info.warnings.append(f"{path}: no summary.json: the run was interrupted")
     for name in ("grd", "recording", "config", "recorded_s", "output_hash", "records", "sweeps", "fixes", "poses"):
         if name in values:
             info.facts.append((name, str(values[name])))
-    for name, error in (values.get("truth_errors") or {}).items():
-        info.facts.append((f"error of {name}", str(error)))
+    for key, what in (("truth_errors", "LiDAR positions"), ("pose_errors", "fused poses")):
+        errors = values.get(key, {})
+        info.facts += [
+            (f"{what} against the truth, {name}", "-" if error is None else str(error))
+            for name, error in errors.items()
+        ]
     info.warnings += values.get("warnings", [])
     files = sorted(file for file in path.iterdir() if file.is_file())
     info.columns = ("file", "kB")
     info.rows = [(file.name, f"{file.stat().st_size / 1e3:.1f}") for file in files]
+
+
+def _summary(file: Path) -> dict[str, Any]:
+    """The values of a run's summary.json. LinkError when it is damaged."""
+    try:
+        values = json.loads(file.read_text(encoding="utf-8"))
+        if not isinstance(values, dict):
+            raise ValueError("it is no object")
+        for name, kind in (("truth_errors", dict), ("pose_errors", dict), ("warnings", list)):
+            if not isinstance(values.get(name, kind()), kind):
+                raise ValueError(f"{name} is no {kind.__name__}")
+    except (ValueError, RecursionError) as error:
+        raise LinkError(
+            f"{file} is damaged ({error}): replay the recording to write it again (`grd replay`), or remove it to see "
+            "the run's other files"
+        ) from None
+    return values
 
 
 _READERS: dict[FileKind, Callable[[Path, FileInfo], None]] = {

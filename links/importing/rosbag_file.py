@@ -36,7 +36,7 @@ from links.ros.mapping import (
     checked,
     guess,
 )
-from links.ros.point_cloud import CloudEncoder
+from links.ros.point_cloud import FAR_M, MIN_FAR, CloudEncoder
 from links.ros.streams import ServoReader, image_records, odometry_records, stamp_ns
 from stages.geometry.rig_lidar import RigLidar
 
@@ -81,7 +81,8 @@ class RosbagFile(ImportedFile):
             return None
         if SERVO in (stream for stream, _ in self._by_topic.values()):
             raise LinkError(
-                f"{self._source}: its LiDAR is on a servo, and no bag says how: give its rig with --rig RIG.yaml"
+                f"{self._source}: its LiDAR is on a servo, and a bag does not contain its mount: give its rig with "
+                "--rig RIG.yaml"
             )
         rig = DEFAULT_RIG.format(model=self._model.form.profile.model)
         if self._made_unit is None:
@@ -107,6 +108,8 @@ class RosbagFile(ImportedFile):
         """See ImportedFile."""
         if self._clouds is not None and self._clouds.second_returns:
             self._skipped["second returns of a pulse"] = self._clouds.second_returns
+        if self._clouds is not None and self._clouds.clouds_without_order:
+            self._skipped["clouds before the order of their rings was known"] = self._clouds.clouds_without_order
         unused = {
             f"messages on {topic.name} ({topic.type}), which no stream takes": topic.messages
             for topic in self._bag.topics
@@ -124,6 +127,11 @@ class RosbagFile(ImportedFile):
 
     def nothing_found(self) -> str:
         """See ImportedFile."""
+        if self._clouds is not None and self._clouds.clouds_without_order:
+            return (
+                f"{self._source}: no cloud shows the order of its rings (it takes {MIN_FAR} points beyond "
+                f"{FAR_M:g} m): import the LiDAR's packets"
+            )
         types = ", ".join(f"{topic.name} ({topic.type})" for topic in self._bag.topics if topic.messages)
         return f"{self._source}: nothing that grd can use: {types or 'the bag has no messages'}. `grd info` shows more"
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from flow.link import LinkError, Record
 from links.importing.imported_file import ImportedFile
-from links.mavlink.made_frames import PX4, FrameMaker, Gnss
+from links.mavlink.made_frames import OUT_OF_RANGE, PX4, FrameMaker, Gnss
 from links.mavlink.ned_frd import R_odom_drone_from_wxyz, rpy_from_R_odom_drone
 
 IMU, ATTITUDE, POSITION, STATUS = "sensor_combined", "vehicle_attitude", "vehicle_local_position", "vehicle_status"
@@ -45,7 +45,11 @@ def read_ulog(path: Path, topics: list[str] | None = None) -> Any:
         with contextlib.redirect_stdout(io.StringIO()):  # it prints what it skips, and sets `file_corruption`
             return pyulog.ULog(str(path), topics, disable_str_exceptions=True)
     except damage as error:
-        raise LinkError(f"{path}: the log cannot be read: {(str(error) or repr(error)).splitlines()[0]}") from None
+        reason = (str(error) or repr(error)).splitlines()[0]
+        raise LinkError(
+            f"{path}: the log cannot be read: {reason}: copy it from the autopilot again, or import the telemetry log "
+            "(.tlog) of this flight"
+        ) from None
 
 
 class UlogFile(ImportedFile):
@@ -85,8 +89,13 @@ class UlogFile(ImportedFile):
             self._done = count / len(every)
             try:
                 yield from readers[name](at_ns, self._data[name], int(index[k]))
-            except (KeyError, ValueError) as error:
-                raise LinkError(f"{self._source}: {name} without the fields of a PX4 log: {error}") from None
+            except KeyError as missing:
+                raise LinkError(
+                    f"{self._source}: topic {name} has no field {missing}: it is no log of PX4, or of a version that "
+                    "grd does not know: import the telemetry log (.tlog) of this flight instead"
+                ) from None
+            except (ValueError, OverflowError):
+                self._maker.skipped[OUT_OF_RANGE] += 1
 
     def done_bytes(self) -> int:
         """See ImportedFile."""
@@ -94,7 +103,7 @@ class UlogFile(ImportedFile):
 
     def skipped(self) -> dict[str, int]:
         """See ImportedFile."""
-        return {}
+        return dict(self._maker.skipped)
 
     def warnings(self) -> list[str]:
         """See ImportedFile."""
@@ -139,12 +148,12 @@ class UlogFile(ImportedFile):
 
     def _fix(self, at_ns: int, data: dict[str, Any], k: int) -> Iterator[Record]:
         if "latitude_deg" in data:  # PX4 1.14 and later
-            place = [float(data[name][k]) for name in ("latitude_deg", "longitude_deg", "altitude_msl_m")]
+            position = [float(data[name][k]) for name in ("latitude_deg", "longitude_deg", "altitude_msl_m")]
         else:
-            place = [float(data[name][k]) * unit for name, unit in (("lat", 1e-7), ("lon", 1e-7), ("alt", 1e-3))]
+            position = [float(data[name][k]) * unit for name, unit in (("lat", 1e-7), ("lon", 1e-7), ("alt", 1e-3))]
         fix = Gnss(
             int(data["fix_type"][k]),
-            *place,
+            *position,
             satellites=int(data["satellites_used"][k]),
             hdop=float(data["hdop"][k]) if "hdop" in data else math.nan,
             speed_mps=float(data["vel_m_s"][k]),

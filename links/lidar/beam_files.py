@@ -58,7 +58,7 @@ def hesai_beams(text: str, source: str) -> LidarBeams:
 
 
 def rig_unit(rig_yaml: str, source: str) -> RigLidar:
-    """The LiDAR of a rig file's text. LinkError says what is wrong with it."""
+    """The LiDAR of a rig file's text. Raises LinkError with the reason."""
     try:
         return RigLidar.model_validate(yaml_values(rig_yaml)["lidar"])
     except (YamlTextError, KeyError, TypeError) as error:

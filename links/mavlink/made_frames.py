@@ -8,6 +8,8 @@ Source: https://mavlink.io/en/messages/common.html.
 from __future__ import annotations
 
 import math
+import struct
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -17,6 +19,8 @@ from links.mavlink.transport.framing import dialect
 TOPIC = "/autopilot/rx"
 HEARTBEAT_NS = BEFORE_FIRST_NS = 1_000_000_000
 OUT_OF_ORDER_NS = 1_000_000_000  # values logged later than others by less than this arrive with them
+MAX_TIME_NS = 2**63 - 1
+OUT_OF_RANGE = "values out of range"
 ARDUPILOT, PX4, GENERIC = 3, 12, 0  # MAV_AUTOPILOT
 _QUADROTOR, _ARMED, _ACTIVE, _STANDBY = 2, 128, 4, 3
 _ALL_IMU_FIELDS = 0b111111  # accelerations and rates were updated
@@ -36,10 +40,15 @@ class Gnss(NamedTuple):
 
 
 class FrameMaker:
-    """Frames of one autopilot, system 1, component 1. Vectors are in NED and FRD, angles in rad."""
+    """Frames of one autopilot, system 1, component 1. Vectors are in NED and FRD, angles in rad.
 
-    def __init__(self, autopilot: int = GENERIC) -> None:
+    Values that do not fit their field in MAVLink (damaged: NaN in an integer, a latitude of 1000 deg) give no frame and
+    are counted in `skipped`.
+    """
+
+    def __init__(self, autopilot: int = GENERIC, skipped: Counter[str] | None = None) -> None:
         self._autopilot = autopilot
+        self.skipped: Counter[str] = Counter() if skipped is None else skipped
         self._mavlink = dialect().MAVLink(None, srcSystem=1, srcComponent=1)
         self._boot_ns: int | None = None
         self._heartbeat_ns: int | None = None
@@ -119,18 +128,28 @@ class FrameMaker:
         )
 
     def _frames(self, arrival_ns: int, stamp_ns: int, make: Any) -> Iterator[Record]:
-        """The frame of `make(microseconds since boot)`, after a HEARTBEAT that is due."""
+        """The frame of `make(microseconds since boot)`, after a HEARTBEAT that is due; none for damaged values."""
         if self._newest_ns - OUT_OF_ORDER_NS < arrival_ns < self._newest_ns:  # their sequence numbers are in order
             arrival_ns = self._newest_ns
-        self._newest_ns = arrival_ns
-        if self._boot_ns is None:
-            self._boot_ns = stamp_ns - BEFORE_FIRST_NS
-        if self._heartbeat_ns is None or arrival_ns >= self._heartbeat_ns + HEARTBEAT_NS:
-            self._heartbeat_ns = arrival_ns
-            mode, state = (_ARMED, _ACTIVE) if self.armed else (0, _STANDBY)
-            heartbeat = dialect().MAVLink_heartbeat_message(_QUADROTOR, self._autopilot, mode, 0, state, 3)
-            yield self._record(arrival_ns, heartbeat)
-        yield self._record(arrival_ns, make(max((stamp_ns - self._boot_ns) // 1000, 0)))
+        boot_ns = stamp_ns - BEFORE_FIRST_NS if self._boot_ns is None else self._boot_ns
+        due = self._heartbeat_ns is None or arrival_ns >= self._heartbeat_ns + HEARTBEAT_NS
+        sequence_number = self._mavlink.seq
+        try:
+            if not 0 <= arrival_ns <= MAX_TIME_NS:
+                raise OverflowError
+            records = [self._record(arrival_ns, self._heartbeat())] if due else []
+            records.append(self._record(arrival_ns, make(max((stamp_ns - boot_ns) // 1000, 0))))
+        except (ValueError, OverflowError, struct.error):
+            self._mavlink.seq = sequence_number
+            self.skipped[OUT_OF_RANGE] += 1
+            return
+        self._newest_ns, self._boot_ns = arrival_ns, boot_ns
+        self._heartbeat_ns = arrival_ns if due else self._heartbeat_ns
+        yield from records
+
+    def _heartbeat(self) -> Any:
+        mode, state = (_ARMED, _ACTIVE) if self.armed else (0, _STANDBY)
+        return dialect().MAVLink_heartbeat_message(_QUADROTOR, self._autopilot, mode, 0, state, 3)
 
     def _record(self, arrival_ns: int, message: Any) -> Record:
         data = bytes(message.pack(self._mavlink))

@@ -30,10 +30,10 @@ _FRAMING_OK = 1
 
 
 class AutopilotReader:
-    """Records of /autopilot/rx. `skipped` counts damaged frames."""
+    """Records of /autopilot/rx. `skipped` counts damaged frames and values."""
 
     def __init__(self, skipped: Counter[str]) -> None:
-        self._maker = FrameMaker()
+        self._maker = FrameMaker(skipped=skipped)
         self._skipped = skipped
 
     def records(self, message: BagMessage, use: TopicUse) -> Iterator[Record]:

@@ -47,7 +47,7 @@ class BagMessage:
 
 
 class Bag:
-    """`with Bag(path) as bag: for message in bag.messages(["/velodyne_packets"])`. LinkError says why it fails."""
+    """`with Bag(path) as bag: for message in bag.messages(["/velodyne_packets"])`. Raises LinkError with the reason."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

@@ -1,7 +1,7 @@
 """A recording or a run as a ROS 2 bag: a folder with one MCAP file and metadata.yaml, as `ros2 bag` writes it.
 
 The folder appears when it is complete. Foxglove opens the MCAP file, `ros2 bag play` the folder; `grd import` gives the
-recording's packets, pictures and frames back byte for byte.
+recording's packets, images and frames back byte for byte.
 
 Source: ours; rosbags (https://ternaris.gitlab.io/rosbags), rosbag2 format version 9.
 """
@@ -54,7 +54,7 @@ def export(
     messages = _messages(source, recording, warnings, progress)
     first = next(messages, None)
     if first is None:
-        raise LinkError(f"{source}: nothing that ROS has a message for")
+        raise LinkError(f"{source}: no record that `grd export` converts: `grd info {source}` shows its topics")
     try:
         folder = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.absolute().parent))
     except OSError as error:
@@ -114,17 +114,17 @@ def _kept() -> list[Any]:
     """The quality of service of static transforms."""
     from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 
-    for_ever = QosTime(9_223_372_036, 854_775_807)
+    infinite = QosTime(9_223_372_036, 854_775_807)
     return [
         Qos(
             QosHistory.KEEP_LAST,
             1,
             QosReliability.RELIABLE,
             QosDurability.TRANSIENT_LOCAL,
-            for_ever,
-            for_ever,
+            infinite,
+            infinite,
             QosLiveliness.AUTOMATIC,
-            for_ever,
+            infinite,
             False,
         )
     ]

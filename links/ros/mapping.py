@@ -49,6 +49,7 @@ TYPES: dict[str, tuple[str, ...]] = {
 _DRONE = re.compile(r"drone|uav|copter|quad|down|mavros", re.I)
 _VEHICLE = re.compile(r"vehicle|ugv|car|rover|husky|up(?![a-z])|roof", re.I)
 _SERVO = re.compile(r"servo|turntable|dynamixel|pan|joint", re.I)
+_GLOBAL = re.compile(r"global_position")  # of mavros: by GNSS, not the pose that the autopilot flies with
 _NOT_PACKETS = re.compile(r"imu", re.I)
 
 
@@ -81,7 +82,7 @@ class BagMapping(BaseModel):
 
 
 def read_mapping(file: Path) -> BagMapping:
-    """A mapping file. LinkError says what is wrong with it."""
+    """A mapping file. Raises LinkError with the reason."""
     try:
         tree = yaml_values(file.read_bytes())
         if not isinstance(tree, dict) or not tree:
@@ -143,6 +144,7 @@ def _named(stream: str, fits: list[BagTopic]) -> list[BagTopic]:
     if stream == AUTOPILOT:
         frames = [topic for topic in fits if topic.type == MAVLINK and not topic.name.endswith("/to")][:1]
         drone = [topic for topic in fits if topic.type != MAVLINK and _DRONE.search(topic.name)]
+        drone = [topic for topic in drone if topic.type != POSE or not _GLOBAL.search(topic.name)]
         return frames or [topic for topic in drone if topic == next(t for t in drone if t.type == topic.type)]
     if stream == DRONE_CAMERA:
         return [topic for topic in fits if _DRONE.search(topic.name)][:1]

@@ -31,9 +31,12 @@ Array = NDArray[np.float64]
 RINGS, TIMES = ("ring", "channel"), ("time", "t", "timestamp", "time_stamp")
 REFLECTIVITIES = ("reflectivity", "intensity")
 FAR_M = 2.0  # nearer points do not show which beam they are of
-MIN_FAR = 30  # points of a ring, to know its elevation
+MIN_FAR = 30  # points, to know the order of the rings
+MAX_WRONG = 0.1  # share of the points that are not on their beam
 MAX_TURN_ERROR_RAD = math.radians(1.0)  # median of the columns' azimuths against a steady rotation
+MAX_SPAN_NS = 1_000_000_000  # of the times in one cloud
 MAX_GAP_NS = 60_000_000  # between two clouds; longer: packets are missing
+MAX_TIME_S = 4e9  # of damaged times; in ns it fits 64 bits
 _TYPES = {1: "i1", 2: "u1", 3: "<i2", 4: "<u2", 5: "<i4", 6: "<u4", 7: "<f4", 8: "<f8"}
 
 
@@ -56,7 +59,10 @@ class CloudEncoder:
         self._first_column = self._last_column = 0  # of an Ouster: of this cloud, and of the waiting sequences
         self._epoch_ns = 0  # times of sequences count from it
         self._waiting = _Sequences(np.zeros(0), np.zeros(0), np.zeros((0, count, 2)))  # they do not fill a packet yet
+        self._order: NDArray[np.int64] | None = None  # laser of each ring; None: not known yet
         self.second_returns = 0
+        self.clouds_without_order = 0
+        """Clouds that were skipped because the order of the rings was not known yet."""
 
     def packets(self, cloud: Any, stamp_ns: int) -> list[tuple[int, bytes]]:
         """(time of the first pulse, payload) of the packets that this cloud completes. LinkError if it does not fit."""
@@ -64,7 +70,18 @@ class CloudEncoder:
         if points is None:
             return []
         xyz, ring, at_ns, shade = points
-        laser = self._lasers(xyz, ring)[ring]
+        span_ns = int(at_ns[-1]) - int(at_ns[0])
+        if span_ns > MAX_SPAN_NS:
+            raise LinkError(
+                f"{self._topic}: the times of the points in one cloud span {span_ns * 1e-9:.1f} s: times are damaged, "
+                "or in another unit than s (floats) or ns (integers): remove this topic from the mapping file and "
+                "import the packets, or correct the bag"
+            )
+        order = self._lasers(xyz, ring)
+        if order is None:
+            self.clouds_without_order += 1
+            return []
+        laser = order[ring]
         range_m, azimuth = self._beams(xyz, laser)
         number, start_ns = self._numbers(azimuth, at_ns, laser)
         turn_ns = self._delay_ns[laser] if self._profile.turns_while_firing else np.zeros(len(laser))
@@ -128,33 +145,40 @@ class CloudEncoder:
         """Absolute times: integers are ns after the cloud's stamp, floats s after it or, above 1e6, s since 1970."""
         if values.dtype.kind != "f":
             return stamp_ns + values.astype(np.int64)
-        finite = np.nan_to_num(values.astype(np.float64))
+        finite = np.clip(np.nan_to_num(values.astype(np.float64)), -MAX_TIME_S, MAX_TIME_S)
         if np.median(finite) > 1e6:
             whole = np.floor(finite)
             return whole.astype(np.int64) * 1_000_000_000 + np.rint((finite - whole) * 1e9).astype(np.int64)
         return stamp_ns + np.rint(finite * 1e9).astype(np.int64)
 
-    def _lasers(self, xyz: Array, ring: NDArray[np.int64]) -> NDArray[np.int64]:
-        """The laser of each ring, in the packet's order. LinkError where the rings are not the model's beams."""
+    def _lasers(self, xyz: Array, ring: NDArray[np.int64]) -> NDArray[np.int64] | None:
+        """The laser of each ring, by the first cloud that shows it: packet order or by elevation; None: not known yet.
+
+        LinkError where the rings are not the model's beams.
+        """
         lasers = self._profile.lasers
         if ring.min() < 0 or ring.max() >= lasers:
             raise LinkError(f"{self._topic}: rings {ring.min()} to {ring.max()}{self._not_the_model()}")
-        rho, z = np.hypot(xyz[:, 0], xyz[:, 1]), xyz[:, 2]
+        rho = np.hypot(xyz[:, 0], xyz[:, 1])
         far = rho > FAR_M
-        orders = {"packet": np.arange(lasers), "elevation": np.argsort(self._elevation, kind="stable")}
-        tolerance = max(0.5 * self._profile.beam_spacing_rad, math.radians(0.2))
-        wrong: dict[str, float] = {}
-        for name, order in orders.items():
-            laser = order[ring[far]]
-            level = self._level(rho[far], laser)
-            error = np.abs(np.arctan2(z[far] - self._z_offset_m[laser], level) - self._elevation[laser])
-            wrong[name] = float(np.mean(error > tolerance)) if len(error) >= MIN_FAR else 0.0
-        best = min(wrong, key=lambda name: wrong[name])
-        if wrong[best] > 0.1:
+        if np.count_nonzero(far) < MIN_FAR:
+            return self._order
+        orders = [np.arange(lasers), np.argsort(self._elevation, kind="stable")]
+        known = orders if self._order is None else [self._order]
+        wrong = [self._off_beam(rho[far], xyz[far, 2], order[ring[far]]) for order in known]
+        if min(wrong) > MAX_WRONG:
             raise LinkError(
-                f"{self._topic}: {100 * wrong[best]:.0f} % of the points are not on their beam{self._not_the_model()}"
+                f"{self._topic}: {100 * min(wrong):.0f} % of the points are not on their beam{self._not_the_model()}"
             )
-        return orders[best]
+        if self._order is None and (max(wrong) > MAX_WRONG or (orders[0] == orders[1]).all()):
+            self._order = orders[int(np.argmin(wrong))]
+        return self._order
+
+    def _off_beam(self, rho: Array, z: Array, laser: NDArray[np.int64]) -> float:
+        """Share of points that are not on the beam of their laser."""
+        tolerance = max(0.5 * self._profile.beam_spacing_rad, math.radians(0.2))
+        elevation = np.arctan2(z - self._z_offset_m[laser], self._level(rho, laser))
+        return float(np.mean(np.abs(elevation - self._elevation[laser]) > tolerance))
 
     def _not_the_model(self) -> str:
         model = self._profile.model

@@ -80,7 +80,7 @@ class RecordingMessages:
             yield from self._static(record.arrival_ns)
         topic = record.topic
         if topic == "/lidar/packets":
-            if self._packets and record.stamp_ns - self._packets[0].stamp_ns >= CLOUD_NS:
+            if self._packets and abs(record.stamp_ns - self._packets[0].stamp_ns) >= CLOUD_NS:  # a clock may step
                 yield from self.end()
             self._packets.append(record)
             if self._lidar is not None and (firings := self._lidar.decode(record)) is not None:

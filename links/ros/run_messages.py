@@ -1,7 +1,8 @@
 """The results in a run's folder as ROS 2 messages: fused poses, LiDAR positions, transforms and diagnostics.
 
-`/grd/pose` and `/grd/odometry` are the drone in frame `vehicle`; rows of the covariance that belong to an unknown
-rotation have a variance of pi^2 rad^2. `/grd/position` is the LiDAR's alone. Recorded at the time of measurement.
+`/grd/pose` and `/grd/odometry` are the drone in frame `vehicle`; an unknown rotation is the identity with a variance of
+pi^2 rad^2 about each axis. A transform has no covariance: `/tf` has none while the rotation is unknown. `/grd/position`
+is the LiDAR's alone. Recorded at the time of measurement.
 
 Source: the run's files (`links/runs/results.py`); ROS 2 common_interfaces.
 """
@@ -20,12 +21,19 @@ from links.evaluation.text_files import Trajectory, read_tum
 from links.ros.mapping import POSE
 from links.ros.message_types import header
 from links.ros.recording_messages import TF, Entry, fixed_covariance, pose_values, transform_values
-from links.runs.results import COVARIANCE_FILE, FIX_FILE, POSE_COVARIANCE_FILE, POSE_FILE, POSE_UPPER, UPPER
+from links.runs.results import (
+    COVARIANCE_FILE,
+    FIX_FILE,
+    POSE_COVARIANCE_FILE,
+    POSE_FILE,
+    POSE_UPPER,
+    UNKNOWN_RAD2,
+    UPPER,
+)
 
 POSE_MESSAGE, DIAGNOSTICS = "geometry_msgs/msg/PoseWithCovarianceStamped", "diagnostic_msgs/msg/DiagnosticArray"
 OK, WARN = 0, 1  # DiagnosticStatus
 UNKNOWN = (0.0, 0.0, 0.0, 1.0)
-_NO_ROTATION_RAD2 = np.pi**2
 _SHOWN = ("accepted", "rotation", "resets", "nis", "measured_s", "track_id")
 
 
@@ -45,7 +53,7 @@ def run_messages(folder: Path, *, whole: bool) -> Iterator[Entry]:
 
 
 def _poses(folder: Path) -> Iterator[Entry]:
-    """A pose, an odometry, a transform and a diagnosis for each fused pose."""
+    """A pose, an odometry and a diagnosis for each fused pose, and a transform where its rotation is known."""
     poses, rows = _pairs(folder, POSE_FILE, POSE_COVARIANCE_FILE)
     upper = np.triu_indices(6)
     for k, row in enumerate(rows):
@@ -67,7 +75,8 @@ def _poses(folder: Path) -> Iterator[Entry]:
                 "twist": {"covariance": [-1.0] + 35 * [0.0]},  # not known
             },
         )
-        yield "/tf", TF, at_ns, transform_values(at_ns, "vehicle", "drone", xyz_m, q)
+        if row["rotation"] == "1":
+            yield "/tf", TF, at_ns, transform_values(at_ns, "vehicle", "drone", xyz_m, q)
         yield "/diagnostics", DIAGNOSTICS, at_ns, _diagnosis(at_ns, row)
 
 
@@ -79,7 +88,7 @@ def _positions(folder: Path) -> Iterator[Entry]:
         at_ns = int(fixes.stamps_ns[k])
         block = np.zeros((3, 3))
         block[upper] = [float(row[f"c{name}_m2"]) for name in UPPER]
-        covariance = np.diag([0.0] * 3 + [_NO_ROTATION_RAD2] * 3)
+        covariance = np.diag([0.0] * 3 + [UNKNOWN_RAD2] * 3)
         covariance[:3, :3] = block + np.triu(block, 1).T
         pose = {"pose": pose_values(fixes.xyz_m[k], UNKNOWN), "covariance": covariance.ravel()}
         yield "/grd/position", POSE_MESSAGE, at_ns, {"header": header(at_ns, "vehicle"), "pose": pose}

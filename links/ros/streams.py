@@ -57,11 +57,12 @@ def stamp_ns(message: BagMessage, use: TopicUse, stamp: Any | None = None) -> in
     if stamp is None or use.stamp == "arrival":
         return message.time_ns
     at_ns = time_ns(stamp)
-    apart_s = abs(at_ns - message.time_ns) * 1e-9
-    if apart_s > EPOCH_LIMIT_S:
+    difference_s = abs(at_ns - message.time_ns) * 1e-9
+    if difference_s > EPOCH_LIMIT_S:
         raise LinkError(
-            f"{message.topic}: its header's clock is {apart_s:.0f} s from the bag's, another epoch: "
-            "set `stamp: arrival` for this topic in the mapping file, to use the time of recording"
+            f"{message.topic}: its header's clock is {difference_s:.0f} s from the bag's, another epoch: "
+            "set `stamp: arrival` for this topic in the mapping file (`grd info BAG --map FILE` writes it), to use the "
+            "time of recording"
         )
     return at_ns
 
@@ -95,26 +96,34 @@ class ServoReader:
 def _joint(message: BagMessage, use: TopicUse) -> int:
     """Index of the servo's joint. LinkError where it is not known or not there."""
     names = [str(name) for name in message.value.name]
-    if use.joint is None and len(names) == 1:
-        return 0
-    if use.joint not in names:
-        wanted = "several joints" if use.joint is None else f"no joint {use.joint!r}"
-        raise LinkError(f"{message.topic}: {wanted} ({', '.join(names)}): set `joint` in the mapping file")
-    index = names.index(use.joint)
+    joint = names[0] if use.joint is None and len(names) == 1 else use.joint
+    if joint not in names:
+        wanted = "several joints" if joint is None and names else "no joint" if joint is None else f"no joint {joint!r}"
+        raise LinkError(
+            f"{message.topic}: {wanted} ({', '.join(names) or 'it names none'}): set `joint` of {SERVO} in the "
+            f"mapping file (`grd info BAG --map FILE` writes it), or delete the line {SERVO} if there is no servo"
+        )
+    index = names.index(joint)
     if index >= len(message.value.position):
-        raise LinkError(f"{message.topic}: no position for joint {use.joint!r}")
+        raise LinkError(
+            f"{message.topic}: a message without the position of joint {joint!r}: set another `joint` or topic for "
+            f"{SERVO} in the mapping file (`grd info BAG --map FILE` writes it), or delete its line"
+        )
     return index
 
 
 def image_records(stream: str, message: BagMessage, use: TopicUse) -> Iterator[Record]:
-    """One picture as JPEG: a JPEG as it is, others encoded."""
+    """One image as JPEG: a JPEG as it is, others encoded."""
     at_ns, value = stamp_ns(message, use), message.value
     if message.type.endswith("CompressedImage"):
         data = bytes(value.data)
         if not data.startswith(_JPEG):
             pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
             if pixels is None:
-                raise LinkError(f"{message.topic}: a picture of format {value.format!r}: JPEG and PNG are read")
+                raise LinkError(
+                    f"{message.topic}: an image of format {value.format!r} is not read: convert the topic to JPEG or "
+                    "PNG, or remove it from the mapping file"
+                )
             data = _jpeg(pixels)
     else:
         data = _jpeg(_pixels(message))
@@ -127,12 +136,15 @@ def _pixels(message: BagMessage) -> NDArray[np.uint8]:
     value = message.value
     encoding, height, width, step = str(value.encoding), int(value.height), int(value.width), int(value.step)
     if encoding not in _TO_BGR:
-        raise LinkError(f"{message.topic}: pictures of encoding {encoding!r}: {', '.join(_TO_BGR)} are read")
+        raise LinkError(
+            f"{message.topic}: images of encoding {encoding!r} are not read: convert the topic to one of "
+            f"{', '.join(_TO_BGR)}, or remove it from the mapping file"
+        )
     channels = _CHANNELS.get(encoding, 1)
     if not (height and width and step >= width * channels and len(value.data) == height * step):
         raise LinkError(
-            f"{message.topic}: a picture of {width} x {height} {encoding} with rows of {step} bytes has "
-            f"{len(value.data)} bytes"
+            f"{message.topic}: an image of {width} x {height} {encoding} with rows of {step} bytes has "
+            f"{len(value.data)} bytes: it is damaged; remove the topic from the mapping file to import the others"
         )
     pixels = np.asarray(value.data, np.uint8).reshape(height, step)[:, : width * channels]
     pixels = pixels.reshape((height, width) if channels == 1 else (height, width, channels))

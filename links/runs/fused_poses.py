@@ -1,6 +1,8 @@
 """The fused poses of a run, read back from its files, and their errors against the truth.
 
-Source: ours; columns in links/runs/results.py. A live run of an hour has 180 000 poses: they are not kept in memory.
+The poses are read whole at the end of the run; during a run they are in its files only.
+
+Source: ours; files in links/runs/results.py.
 """
 
 from __future__ import annotations
@@ -63,20 +65,18 @@ class FusedPoses:
 def read_fused_poses(folder: Path, truth: TruthLog) -> FusedPoses | None:
     """The poses in the folder of a run; None when there are none, or a full disk has cut the files off."""
     try:
-        lines, rows = (
-            (folder / name).read_text("utf-8").splitlines()[1:] for name in (POSE_FILE, POSE_COVARIANCE_FILE)
-        )
+        lines = (folder / POSE_FILE).read_text("utf-8").splitlines()[1:]
+        head, *rows = (folder / POSE_COVARIANCE_FILE).read_text("utf-8").splitlines()
         if not lines or len(lines) != len(rows):
             return None
         poses = np.loadtxt(lines, usecols=range(1, 8), ndmin=2)
         table = np.loadtxt(rows, dtype=str, delimiter=",", ndmin=2)
+        of = dict(zip(head.split(","), table.T, strict=True))
     except (FileNotFoundError, ValueError):
         return None
-    columns = ("stamp_s", *POSE_UPPER, "state", "accepted", "rotation", "resets", "nis", "measured_s", "track_id")
-    of = {name: table[:, index] for index, name in enumerate(columns)}
     stamps_ns = np.array([int(text.replace(".", "")) for text in of["stamp_s"]], dtype=np.int64)
     covariance = np.zeros((len(poses), 6, 6))
-    upper = table[:, 1 : 1 + len(POSE_UPPER)].astype(np.float64)
+    upper = np.stack([of[name] for name in POSE_UPPER], axis=1).astype(np.float64)
     covariance[:, UPPER_6[0], UPPER_6[1]] = covariance[:, UPPER_6[1], UPPER_6[0]] = upper
     rotated = of["rotation"] == "1"
     R = Rotation.from_quat(poses[:, 3:])
@@ -117,3 +117,9 @@ def _errors(
         between_R = R_before * Rotation.from_rotvec(weight * (R_before.inv() * R_after).as_rotvec())
         angle_rad[rows] = (Rotation.from_quat(R.as_quat()[rows]).inv() * between_R).magnitude()
     return error_m, angle_rad
+
+
+def rms(values: Array64) -> float:
+    """Root mean square of the values that are not NaN; NaN if there is none."""
+    known = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(known**2))) if len(known) else float("nan")

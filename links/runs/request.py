@@ -10,7 +10,7 @@ from pathlib import Path
 
 from flow.graph import Graph, load_graph
 from flow.replay import RunReport
-from links.runs.fused_poses import FusedPoses
+from links.runs.fused_poses import FULL, FusedPoses
 from links.runs.results import Results
 from links.runs.truth import FixErrors
 from links.runs.usage import Usage
@@ -42,10 +42,15 @@ class RunResult:
     report: RunReport
     results: Results
     errors: FixErrors | None  # of the LiDAR positions; None: the truth is not known
-    poses: FusedPoses | None  # None: no stage fuses, or no position was ever known
+    poses: FusedPoses | None  # None: no stage fuses, no position, or files cut off
     output_hash: str | None  # None: not computed
     wall_s: float
     warnings: list[str]
     usage: Usage | None = None  # of a live run
     parts: int | None = None  # of the recording that a replay read
     stage_outputs: str = ""  # stages and message counts, when no stage of the configuration searches for a drone
+
+    @property
+    def counted_full(self) -> bool:
+        """Whether a stage published a pose with a rotation, also when a full disk has cut the pose files off."""
+        return any(self.results.pose_states.get(state) for state in FULL)

@@ -14,7 +14,7 @@ import numpy as np
 from flow.config.secrets import without_secrets
 from flow.live.report import LiveReport
 from links import __version__
-from links.runs.fused_poses import FusedPoses
+from links.runs.fused_poses import FusedPoses, rms
 from links.runs.request import RunRequest, RunResult
 from links.runs.results import stamp_s
 from links.runs.truth import FixErrors
@@ -125,7 +125,7 @@ def _pose_errors(poses: FusedPoses) -> dict[str, Any]:
         "rmse_xyz_m": [round(float(v), 4) for v in poses.rmse_xyz_m],
         "max_m": round(float(np.nanmax(poses.distance_m)), 4),
         "rotations": len(angle_deg),
-        "rmse_deg": round(float(np.sqrt(np.mean(angle_deg**2))), 4) if len(angle_deg) else None,
+        "rmse_deg": round(rms(angle_deg), 4) if len(angle_deg) else None,
         "max_deg": round(float(angle_deg.max()), 4) if len(angle_deg) else None,
         "inside_95_percent_ellipsoid": round(poses.inside_95, 4),
     }

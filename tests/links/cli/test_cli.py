@@ -56,6 +56,9 @@ def test_a_wrong_argument_is_explained(grd, arguments, message):
 
 def test_a_run_prints_the_pose_of_the_drone_its_errors_and_the_result_files(grd, tmp_path):
     text = grd("replay", STREET, "--config", ROOT / "configs" / "estimate.yaml")
+    info = grd("info", tmp_path / "out" / "street_sweep-estimate")
+    for what in ("LiDAR positions against the truth, rmse_3d_m: 0.", "fused poses against the truth, rmse_xyz_m: [0."):
+        assert what in info
     folder = tmp_path / "out" / "street_sweep-estimate"
     for words in (
         "vehicle frame",
@@ -273,7 +276,12 @@ def test_view_opens_the_newest_run_or_the_one_in_a_folder(grd, tmp_path, monkeyp
 def test_the_list_of_commands_has_the_beginning_of_the_help_of_each(grd, name):
     _, text = COMMANDS[name]
     assert " ".join((command_named(name).help or "").split()).startswith(text.rstrip("."))
+    assert text.endswith(".")
     assert text in " ".join(grd("--help").split())
+
+
+def test_the_help_of_a_second_configuration_says_that_overlays_and_settings_are_the_firsts(grd):
+    assert "--overlay and --set apply to the first CONFIG alone" in " ".join(grd("run", "--help").split())
 
 
 @pytest.mark.parametrize("option", ["--version", "--help"])

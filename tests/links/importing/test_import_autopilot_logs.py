@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import re
 import struct
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,7 @@ from typer.testing import CliRunner
 from flow.link import LinkError
 from links.cli.app import app
 from links.importing import ImportReport, import_file
+from links.importing.dataflash import DataflashLog
 from links.mavlink.autopilot import Autopilot
 from links.mavlink.transport.framing import parse_frame
 from links.recording import RecordingReader
@@ -137,6 +140,31 @@ def test_a_dataflash_log_that_is_cut_or_damaged_gives_the_rest_with_a_warning(tm
     report, messages, _ = imported(tmp_path, "a.bin", bytes(content[:-10]))
     assert 95 <= len(of(messages, DroneImu)) < 100
     assert "bad bytes" in report.warnings[0]
+
+
+def test_the_end_of_a_dataflash_log_is_the_first_warning_and_the_others_take_no_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    from pymavlink import DFReader
+
+    receive, count = DFReader.DFReader_binary.recv_msg, 0
+
+    def fails(log: Any) -> Any:
+        nonlocal count
+        count += 1
+        if count > 100:
+            raise ValueError("broken")
+        sys.stdout.write("bad bytes\n" + 1000 * "more\n")
+        return receive(log)
+
+    monkeypatch.setattr(DFReader.DFReader_binary, "recv_msg", fails)
+    (tmp_path / "a.bin").write_bytes(flight())
+    log = DataflashLog(tmp_path / "a.bin")
+    assert 50 < len(list(log.messages())) <= 100
+    end, skipped = log.warnings()
+    assert re.search(r"a.bin: ends at \d+ % of its bytes: broken: the rest is missing", end)
+    assert skipped.endswith("a.bin: bad bytes (and 100099 more)")
+    assert len(log._noise.first) < 1000
 
 
 def test_a_dataflash_log_without_sensors_is_refused(tmp_path: Path):
@@ -292,7 +320,10 @@ def test_a_ulog_that_is_damaged_or_empty_is_refused(tmp_path: Path):
     for content, says in (
         (whole[:20], "no IMU, attitude, position or GNSS|cannot be read"),
         (ulog({"other": ("uint64_t timestamp;float x;", [(1, 1.0)])}), "no IMU, attitude, position or GNSS"),
-        (ulog({"sensor_combined": ("uint64_t timestamp;float x;", [(1, 1.0)])}), "without the fields of a PX4 log"),
+        (
+            ulog({"sensor_combined": ("uint64_t timestamp;float x;", [(1, 1.0)])}),
+            r"topic sensor_combined has no field 'gyro_rad\[0\]': .* import the telemetry log",
+        ),
     ):
         (tmp_path / "a.ulg").write_bytes(content)
         with pytest.raises(LinkError, match=says):
@@ -308,6 +339,17 @@ def test_a_ulog_that_is_damaged_or_empty_is_refused(tmp_path: Path):
             import_file(tmp_path / "a.ulg").path.unlink()
         except LinkError:
             assert not (tmp_path / "a.mcap").exists()
+
+
+@pytest.mark.parametrize("latitude_deg", [math.nan, 1e6, math.inf])
+def test_damaged_values_of_a_ulog_are_counted_and_the_rest_is_imported(tmp_path: Path, latitude_deg: float):
+    pytest.importorskip("pyulog")
+    latitude = struct.pack("<d", 35.7)
+    content = px4_flight(new=True).replace(latitude, struct.pack("<d", latitude_deg), 1)
+    report, messages, frames = imported(tmp_path, "flight.ulg", content)
+    assert report.skipped == {"values out of range": 1}
+    assert len(of(messages, DroneImu)) == 250
+    assert len([f for f in frames if f.get_type() == "GPS_RAW_INT"]) == 1
 
 
 def test_without_pyulog_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

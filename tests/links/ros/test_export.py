@@ -18,7 +18,7 @@ from links.importing import import_file
 from links.lidar import Lidar, rig_unit
 from links.recording import RecordingReader, RecordingWriter, decode_compressed_image
 from links.ros.export import export
-from links.ros.recording_messages import fixed_covariance
+from links.ros.recording_messages import RecordingMessages, fixed_covariance
 from links.ros.streams import body_covariance
 from stages.geometry.frames import rotation_from_quaternion_xyzw
 
@@ -120,6 +120,19 @@ def test_exported_points_are_the_decoders(tmp_path: Path):
     for _, m in bag["/lidar/points"]:
         assert [f.name for f in m.fields] == ["x", "y", "z", "intensity", "ring", "t"]
         assert [f.offset for f in m.fields] == [0, 4, 8, 12, 16, 18]
+
+
+def test_clouds_stay_short_after_the_sensors_clock_steps_back(tmp_path: Path):
+    path, rig_yaml, records = small(tmp_path)
+    packets = of(records, "/lidar/packets")
+    step_ns = 3_600_000_000_000
+    half = len(packets) // 2
+    messages = RecordingMessages(rig_yaml, str(path))
+    stepped = [Record(r.topic, r.arrival_ns, r.stamp_ns - step_ns * (k > half), r.data) for k, r in enumerate(packets)]
+    entries = [entry for record in stepped for entry in messages.of(record)]
+    sizes = [len(values["packets"]) for topic, _, _, values in entries if topic == "/lidar/packets"]
+    assert len(sizes) >= 6
+    assert max(sizes) <= 80  # 0.1 s
 
 
 def test_the_transforms_are_the_rigs(tmp_path: Path):
@@ -234,6 +247,19 @@ def test_an_exported_run_has_its_poses_transforms_and_diagnostics(tmp_path: Path
     assert covariance[5, 5] == pytest.approx(np.pi**2)
 
 
+def test_a_pose_whose_rotation_is_unknown_has_no_transform(tmp_path: Path):
+    run = run_folder(tmp_path)
+    table = run / "pose_covariance.csv"
+    table.write_text(table.read_text().replace("COASTING,0,1,", "POSITION_ONLY,0,0,").replace("0.01", "9.8696044"))
+    bag = read(export(run, tmp_path / "bag").path)
+    assert [time_ns for time_ns, _ in bag["/tf"]] == [1_700_000_001_100_000_001]
+    for topic in ("/grd/pose", "/grd/odometry"):
+        assert len(bag[topic]) == 2
+        pose = bag[topic][1][1].pose
+        assert (pose.pose.orientation.x, pose.pose.orientation.w) == (0.0, 1.0)
+        assert pose.covariance[21] == pytest.approx(np.pi**2)
+
+
 def test_a_run_is_exported_with_its_recording(tmp_path: Path):
     path, _, _ = small(tmp_path, 0.3)
     topics = read(export(run_folder(tmp_path), tmp_path / "bag", recording=path).path)
@@ -252,7 +278,11 @@ def test_what_cannot_be_exported_leaves_no_folder(tmp_path: Path):
     ):
         with pytest.raises(LinkError, match=says):
             export(source, tmp_path / "bag")
-    assert {f.name for f in tmp_path.iterdir()} == {"empty", "run"}
+    with RecordingWriter(tmp_path / "log.mcap", rig_yaml=None, lossless=True) as writer:
+        writer.write(Record("/truth/hits", 1, 1, b"{}"))
+    with pytest.raises(LinkError, match=r"no record that `grd export` converts: `grd info .*log.mcap` shows"):
+        export(tmp_path / "log.mcap", tmp_path / "bag")
+    assert {f.name for f in tmp_path.iterdir()} == {"empty", "run", "log.mcap"}
 
 
 def test_an_existing_folder_is_kept_unless_it_is_a_bag_and_may_be_overwritten(tmp_path: Path):

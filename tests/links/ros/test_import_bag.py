@@ -22,6 +22,7 @@ from links.importing import import_file
 from links.importing.info import file_info
 from links.lidar import rig_unit
 from links.mavlink.autopilot import Autopilot
+from links.mavlink.transport.framing import parse_frame
 from links.recording import RecordingReader, decode_compressed_image
 from links.ros.mapping import BagMapping, TopicUse, read_mapping
 from links.vehicle_odometry.odometry import parse_pose
@@ -205,7 +206,7 @@ def test_the_rigs_model_must_be_the_packets(tmp_path: Path):
 def test_a_lidar_on_a_servo_needs_its_rig(tmp_path: Path):
     joint: Entry = ("/joint_states", JOINTS, PACKETS[0].arrival_ns, {"name": ["a"], "position": [0.5]})
     bag = write_bag(tmp_path / "bag", [joint, *scans()])
-    assert "its LiDAR is on a servo" in refused(
+    assert "its LiDAR is on a servo, and a bag does not contain its mount: give its rig" in refused(
         bag,
         tmp_path,
         mapping=mapping(
@@ -219,6 +220,7 @@ def test_a_clock_of_another_epoch_is_an_error_and_the_times_of_recording_can_be_
     text = refused(bag, tmp_path)
     assert "1000000000 s from the bag's" in text
     assert "stamp: arrival" in text
+    assert "`grd info BAG --map FILE`" in text
     use = {"topic": "/velodyne_packets", "stamp": "arrival"}
     _, records, _ = imported(tmp_path, bag, mapping=mapping(lidar_packets=use))
     assert [r.data for r in records] == [r.data for r in PACKETS]
@@ -240,7 +242,10 @@ def test_a_joint_becomes_the_servo(tmp_path: Path):
         for k in range(3)
     ]
     bag = write_bag(tmp_path / "bag", entries)
-    assert "several joints (wheel, pan)" in refused(bag, tmp_path)
+    text = refused(bag, tmp_path)
+    assert "several joints (wheel, pan)" in text
+    assert "`grd info BAG --map FILE`" in text
+    assert "delete the line /servo/state" in text
     use = {"topic": "/joint_states", "joint": "tilt"}
     assert "no joint 'tilt'" in refused(bag, tmp_path, mapping=mapping(servo_state=use))
     _, records, _ = imported(tmp_path, bag, mapping=mapping(servo_state={**use, "joint": "pan"}), rig_yaml=RIG)
@@ -248,6 +253,18 @@ def test_a_joint_becomes_the_servo(tmp_path: Path):
     assert [r.arrival_ns - r.stamp_ns for r in records] == [1000] * 3
     assert_allclose([s["position_rad"] for s in states], [0.0, 0.1, 0.2])
     assert_allclose([s["velocity_radps"] for s in states], [0.0, 10.0, 10.0])
+
+
+@pytest.mark.parametrize(
+    ("names", "words"), [(["pan"], "the position of joint 'pan'"), ([], "no joint (it names none)")]
+)
+def test_a_joint_state_without_a_position_is_refused_with_advice(tmp_path: Path, names: list[str], words: str):
+    bag = write_bag(
+        tmp_path / "bag", [("/joint_states", JOINTS, START_NS, {"header": header(START_NS), "name": names})]
+    )
+    text = refused(bag, tmp_path, rig_yaml=RIG)
+    assert words in text
+    assert "mapping file" in text
 
 
 @pytest.mark.parametrize(
@@ -313,13 +330,16 @@ def test_a_compressed_image_is_kept_as_it_is_and_png_becomes_jpeg(tmp_path: Path
     assert decode_compressed_image(record.data).data == jpeg
     _, (record,), _ = imported(tmp_path, bag(png, "png"))
     assert decode_compressed_image(record.data).data.startswith(b"\xff\xd8\xff")
-    assert "JPEG and PNG are read" in refused(bag(b"theora", "theora"), tmp_path)
+    text = refused(bag(b"theora", "theora"), tmp_path)
+    assert "an image of format 'theora' is not read: convert the topic to JPEG or PNG, or remove it from" in text
 
 
 def test_an_image_that_cannot_be_read_is_refused(tmp_path: Path):
     values = {"header": header(START_NS), "height": 2, "width": 2, "encoding": "32FC1", "step": 8, "data": [0] * 16}
     entry: Entry = ("/roof/image", "sensor_msgs/msg/Image", START_NS, values)
-    assert "encoding '32FC1'" in refused(write_bag(tmp_path / "a", [entry]), tmp_path)
+    text = refused(write_bag(tmp_path / "a", [entry]), tmp_path)
+    assert "images of encoding '32FC1' are not read: convert the topic to one of mono8, " in text
+    assert "or remove it from the mapping file" in text
     wrong = values | {"encoding": "bgr8", "width": 4}
     assert "with rows of 8 bytes has 16" in refused(write_bag(tmp_path / "b", [(*entry[:3], wrong)]), tmp_path)
 
@@ -418,6 +438,21 @@ def test_mavros_topics_become_frames_that_the_autopilots_decoder_reads(tmp_path:
     assert abs(newest[DroneOdometry].stamp_ns - last_ns) < 2_000_000  # late by the least delay, 1 ms
 
 
+def test_damaged_values_of_mavros_are_counted_and_the_rest_is_imported(tmp_path: Path):
+    kinds = {"imu": "sensor_msgs/msg/Imu", "fix": "sensor_msgs/msg/NavSatFix"}
+    good = {"orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}}
+    values = [("imu", {**good, "angular_velocity": {"x": 1e300, "y": 0.0, "z": 0.0}}), ("imu", good)]
+    values += [("fix", {"latitude": 1e10, "longitude": 139.7}), ("fix", {"latitude": 35.7, "longitude": 139.7})]
+    entries: list[Entry] = [
+        (f"/mavros/{name}", kinds[name], START_NS + k * 10**7, {"header": header(START_NS + k * 10**7), **each})
+        for k, (name, each) in enumerate(values)
+    ]
+    report, records, _ = imported(tmp_path, write_bag(tmp_path / "bag", entries))
+    assert report.skipped == {"values out of range": 3}  # HIGHRES_IMU and ATTITUDE of the first, the first position
+    assert [parse_frame(r.data).get_type() for r in records] == ["HEARTBEAT", "HIGHRES_IMU", "ATTITUDE", "GPS_RAW_INT"]
+    assert [r.data[4] for r in records] == [0, 1, 2, 3]  # no sequence number is missing
+
+
 # ---- mapping
 
 
@@ -430,6 +465,7 @@ def test_the_guess_takes_what_names_and_types_say(tmp_path: Path):
         "/camera_up/compressed": image,
         "/drone/camera/compressed": image,
         "/odom": "nav_msgs/msg/Odometry",
+        "/mavros/global_position/local": "nav_msgs/msg/Odometry",  # by GNSS, not the autopilot's estimate
         "/mavros/local_position/odom": "nav_msgs/msg/Odometry",
         "/imu/data": imu,  # the vehicle's own
         "/mavros/imu/data": imu,

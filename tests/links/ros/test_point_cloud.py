@@ -196,6 +196,47 @@ def test_another_model_and_a_compensated_cloud_are_refused():
         encoded(clouds(points, unit, **{k: v.astype(np.float32) for k, v in moved.items()}), unit)
 
 
+def test_a_damaged_time_in_a_cloud_is_refused_before_memory_is_allocated():
+    unit, points = points_of(VLP16, 40)
+    for damaged_s in (3.0, 1e9, -1e30):
+        ((stamp_ns, message),) = clouds(points, unit)
+        message.data = message.data.copy()
+        table = message.data.reshape(-1, message.point_step)
+        (time,) = [field for field in message.fields if field.name == "time"]
+        table[7, time.offset : time.offset + 4] = np.frombuffer(np.float32(damaged_s).tobytes(), np.uint8)
+        with pytest.raises(
+            LinkError, match=r"/points: the times of the points in one cloud span .* s: .* mapping file"
+        ):
+            encoded([(stamp_ns, message)], unit)
+
+
+def test_the_order_of_the_rings_is_decided_once_and_clouds_before_are_skipped():
+    """The first cloud has too few points, the third only near ones: neither shows the order."""
+    unit, before = points_of(VLP16, 400)
+    phase = (before.pulse_stamp_ns - before.pulse_stamp_ns[0]) // 100_000_000
+    keep = (phase > 0) | (np.cumsum(phase == 0) <= 20)
+    points = SimpleNamespace(**{name: values[keep] for name, values in vars(before).items()})
+    near = phase[keep] == 2
+    rho = np.hypot(points.xyz_lidar_m[:, 0], points.xyz_lidar_m[:, 1])
+    points.xyz_lidar_m = points.xyz_lidar_m * np.where(near, 1.0 / rho, 1.0)[:, None]
+    encoder = CloudEncoder(unit, None, "/points")
+    packets = [p for stamp_ns, message in clouds(points, unit) for p in encoder.packets(message, stamp_ns)]
+    assert encoder.clouds_without_order == 1
+    after = joined(decoded([Record("/lidar/packets", at_ns, at_ns, data) for at_ns, data in packets], unit))
+    later = SimpleNamespace(**{name: values[phase[keep] > 0] for name, values in vars(points).items()})
+    share, *_ = compare(later, after, 2_000)
+    assert share > 0.99
+    assert len(after.laser) <= len(later.laser)
+
+
+def test_a_bag_whose_clouds_never_show_the_order_of_their_rings_is_refused_with_advice(tmp_path: Path):
+    unit, points = points_of(VLP16, 4)
+    ((at_ns, message),) = clouds(SimpleNamespace(**{n: v[:20] for n, v in vars(points).items()}), unit)
+    bag = write_bag(tmp_path / "bag", [("/velodyne_points", CLOUD, at_ns + 10**8, vars_of(message))])
+    with pytest.raises(LinkError, match=r"no cloud shows the order of its rings.*import the LiDAR's packets"):
+        import_file(bag, tmp_path / "out.mcap", rig_yaml=DEFAULT_RIG.format(model="VLP-16"))
+
+
 def test_points_in_a_bag_need_a_rig_and_become_packets(tmp_path: Path):
     unit, points = points_of(VLP16, 300)
     entries = [("/velodyne_points", CLOUD, at_ns + 10**8, vars_of(message)) for at_ns, message in clouds(points, unit)]

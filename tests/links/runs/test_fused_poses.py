@@ -9,7 +9,7 @@ import pytest
 
 from flow.link import Record, Run
 from links.runs.fused_poses import read_fused_poses
-from links.runs.results import POSE_FILE, Results
+from links.runs.results import POSE_COVARIANCE_FILE, POSE_FILE, Results
 from links.runs.truth import TruthLog
 from stages.fuse.map_frame import MapFrame
 from stages.fuse.pose_message import MapEstimate, Status, lost, pose
@@ -95,3 +95,17 @@ def test_without_a_position_without_truth_and_with_files_that_are_cut_off(read, 
     assert not poses.has_truth
     (tmp_path / POSE_FILE).write_text("# head\n1.0 2 3\n")
     assert read_fused_poses(tmp_path, TruthLog()) is None
+
+
+def test_columns_are_found_by_their_names(read, tmp_path):
+    before = read([made(1.0, rotation_z(0.5)), made(1.1, state=PoseState.POSITION_ONLY)])
+    table = tmp_path / POSE_COVARIANCE_FILE
+    lines = [line.split(",")[::-1] for line in table.read_text().splitlines()]
+    table.write_text(
+        "".join(",".join(["new", *line] if k == 0 else ["7", *line]) + "\n" for k, line in enumerate(lines))
+    )
+    after = read_fused_poses(tmp_path, TruthLog())
+    assert after is not None
+    assert after.state.tolist() == before.state.tolist()
+    for name in ("stamps_ns", "sigma_m", "sigma_rad", "yaw_rad"):
+        assert np.array_equal(getattr(after, name), getattr(before, name), equal_nan=True)

@@ -98,14 +98,15 @@ def test_images_without_structure_give_no_rotation_and_the_reason():
     check_arrays(output)
 
 
-def test_lines_in_all_directions_leave_a_high_probability_of_no_right_answer():
+def test_lines_in_all_directions_leave_no_probable_answer():
     rng = np.random.default_rng(0)
     angles, others = (tuple(rng.uniform(0, 180, 25).tolist()) for _ in range(2))
     output = pair(
         seen(CameraMount.VEHICLE, np.eye(3), angles, per_direction=2),
         seen(CameraMount.DRONE, np.eye(3), others, per_direction=2),
     )
-    assert not len(output.answers) or output.probabilities[0] < 0.6
+    assert output.probabilities[0] < 0.3
+    assert 1.0 - output.probabilities.sum() > 0.1  # that no answer is right
 
 
 def test_the_rotation_is_that_at_the_time_of_the_drone_s_image():

@@ -17,13 +17,18 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
+from flow.config.yaml_text import YamlTextError, yaml_values
 from flow.link import LinkError
 from links.evaluation.association import EvaluationLimits, interpolate, read_true_drones
 from links.evaluation.text_files import Flags
 from links.runs import results
+from links.runs.run_folder import CONFIG_FILE
 from stages.detect.trained.features import NAMES
 from stages.geometry.frames import Array64
+from stages.geometry.lidar_models import LidarModel
+from stages.geometry.rig_lidar import RigLidar
 
 FIRST_ROWS = 30
 SPARSER = 1.15  # beyond, the ratio of the numbers of two rows used
@@ -58,7 +63,10 @@ class CandidateRows:
 
 
 def read_candidates(runs: Sequence[Path], thin: bool = True) -> CandidateRows:
-    """The rows of all runs. LinkError for a run without truth, with other features, or without a required one."""
+    """The rows of all runs.
+
+    LinkError for a run without truth, without a seed in its name, with other features, or without a required one.
+    """
     parts = [_read(folder, index, thin) for index, folder in enumerate(runs)]
     frame = pd.concat([part for part in parts if len(part)])
     if frame.empty:
@@ -72,6 +80,26 @@ def read_candidates(runs: Sequence[Path], thin: bool = True) -> CandidateRows:
         run=frame.run.to_numpy(dtype=np.int64),
         stamp_ns=frame.stamp_ns.to_numpy(dtype=np.int64),
     )
+
+
+def lidar_model_of(runs: Sequence[Path]) -> LidarModel:
+    """The LiDAR of the runs by their configuration; a run without one has a VLP-16. LinkError: they differ."""
+    models: dict[LidarModel, Path] = {_lidar_model(folder): folder for folder in runs}
+    if len(models) > 1:
+        listed = ", ".join(f"{folder} ({model})" for model, folder in models.items())
+        raise LinkError(f"the runs have different LiDARs, and a model is for one: {listed}")
+    return next(iter(models))
+
+
+def _lidar_model(folder: Path) -> LidarModel:
+    file = folder / CONFIG_FILE
+    if not file.exists():
+        return RigLidar().model
+    try:
+        values = yaml_values(file.read_bytes())
+        return RigLidar.model_validate((values.get("rig") or {}).get("lidar") or {}).model
+    except (YamlTextError, ValidationError, AttributeError) as error:
+        raise LinkError(f"{file}: {error}") from None
 
 
 def _read(folder: Path, index: int, thin: bool) -> pd.DataFrame:
@@ -89,14 +117,21 @@ def _read(folder: Path, index: int, thin: bool) -> pd.DataFrame:
             raise LinkError(f"{file}:{int(missing.argmax()) + 2}: {name} is missing")
     frame["stamp_ns"] = [int(s) * 10**9 + int(f.ljust(9, "0")) for s, f in (t.split(".") for t in frame.stamp_s)]
     known, frame["is_drone"] = _labels(folder, frame)
-    seed = SEED.search(folder.name)
-    frame = frame.assign(run=index, seed=int(seed[1]) if seed else 0).loc[known]
+    frame = frame.assign(run=index, seed=_seed(folder)).loc[known]
     if thin:
         number = frame.groupby(["detector_instance", "candidate"]).cumcount().to_numpy()
         step = np.floor(np.log(np.maximum(number, FIRST_ROWS) / FIRST_ROWS) / np.log(SPARSER))
         before = np.floor(np.log(np.maximum(number - 1, FIRST_ROWS) / FIRST_ROWS) / np.log(SPARSER))
         frame = frame.loc[(number < FIRST_ROWS) | (step != before)]
     return frame
+
+
+def _seed(folder: Path) -> int:
+    """Seed of the recording, by the name of the run: rows of one seed must not be on both sides of a split."""
+    found = SEED.search(folder.name)
+    if found is None:
+        raise LinkError(f"{folder}: the name of the run must contain the seed of its recording, as in park-s7-detector")
+    return int(found[1])
 
 
 def _labels(folder: Path, frame: pd.DataFrame) -> tuple[Flags, Flags]:

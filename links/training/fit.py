@@ -24,15 +24,17 @@ from links.training.candidates import CandidateRows
 from stages.detect.trained.features import FEATURES, NAMES, RANGE, TELEMETRY, VERSION
 from stages.detect.trained.model import ALTERNATIVES, ANY, FAR, NEAR, At, DetectorModel, Term, farness
 from stages.geometry.frames import Array64
+from stages.geometry.lidar_models import LidarModel
 
 KNOTS = 6
 LEAST_KNOWN = 50  # rows that have a feature, to use it
 LLR_KNOTS = (-12.0, -6.0, -3.0, 0.0, 3.0, 6.0, 12.0)  # [nats] of features that are log likelihood ratios
+# assumed: the part of each log likelihood ratio that counts before the data show it
 LLR_SHARE = {"displaced_nats": 0.8, "over_bird_nats": 0.9, "over_balloon_nats": 0.9, "return_count_nats": 0.5}
-PRIOR_PENALTY = 0.02  # of the priors, relative to the other parameters
-STRENGTHS = (0.3, 1.0, 3.0)
+PRIOR_PENALTY = 0.02  # assumed; of the priors, relative to the other parameters
+STRENGTHS = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0)  # of the penalty
 FOLDS = 3
-EASY_SHARE = 0.05  # of the single observations without telemetry that are used; they are most of all rows
+EASY_SHARE = 0.05  # assumed; of the single observations without telemetry that are used; they are most of all rows
 RANGES_M = (0.0, 15.0, 25.0, 35.0, 70.0)  # bands of the scores
 USED: tuple[tuple[str, ...], ...] = (  # features of each alternative
     (
@@ -76,14 +78,16 @@ class _Column:
     alternative: int
     feature: str
     at: At
-    low: float
+    low: float  # of a prior: 1 with telemetry, 0 without
     high: float
     sign: int
     mean: float  # to which the penalty pulls it
 
 
-def train(rows: CandidateRows, trained: dict[str, Any], left_out: Sequence[str] = ()) -> DetectorModel:
-    """The model of these rows. `left_out`: features that it does not use (ablation)."""
+def train(
+    rows: CandidateRows, trained: dict[str, Any], left_out: Sequence[str] = (), lidar_model: LidarModel = "VLP-16"
+) -> DetectorModel:
+    """The model of these rows, of runs with this LiDAR. `left_out`: features that it does not use (ablation)."""
     seeds = np.unique(rows.seed)
     if min(rows.is_drone.sum(), (~rows.is_drone).sum()) < 100 or len(seeds) < 2:
         raise LinkError("training needs at least 100 rows of drones, 100 of others, and two seeds")
@@ -97,12 +101,12 @@ def train(rows: CandidateRows, trained: dict[str, Any], left_out: Sequence[str] 
     strength = min(losses, key=lambda s: losses[s])
     theta = _fitted(A, y, weight, columns, strength)
     trained["strength"], trained["left_out_log_loss"] = strength, {s: round(v, 5) for s, v in losses.items()}
-    return _model(columns, theta, trained)
+    return _model(columns, theta, trained, lidar_model)
 
 
 def predicted(model: DetectorModel, rows: CandidateRows) -> Array64:
     """Probabilities (n,) by the model."""
-    return 1.0 / (1.0 + np.exp(-np.array([model.answer(x).log_odds for x in rows.X])))
+    return 1.0 / (1.0 + np.exp(-np.array([model.predict(x).log_odds for x in rows.X])))
 
 
 def scores(rows: CandidateRows, probability: Array64) -> list[Score]:
@@ -128,7 +132,9 @@ def _columns(rows: CandidateRows, left_out: Sequence[str]) -> list[_Column]:
     some = np.concatenate([drones, rng.choice(others, min(3 * len(drones), len(others)), replace=False)])
     columns: list[_Column] = []
     for alternative, names in enumerate(USED):
-        columns += [_Column(alternative, "", ANY, told, told, 0, 2.0 * told) for told in (0.0, 1.0)]
+        for with_telemetry in (0.0, 1.0):
+            mean = 2.0 * with_telemetry
+            columns.append(_Column(alternative, "", ANY, with_telemetry, with_telemetry, 0, mean))
         for name in names:
             if name in left_out:
                 continue
@@ -136,7 +142,7 @@ def _columns(rows: CandidateRows, left_out: Sequence[str]) -> list[_Column]:
             known = x[~np.isnan(x)]
             if len(known) < LEAST_KNOWN:
                 continue
-            is_llr = name in LLR_SHARE or name == "flight_nats"
+            is_llr = name in LLR_SHARE
             knots = np.array(LLR_KNOTS) if is_llr else np.unique(_rounded(np.quantile(known, _levels())))
             sign = FEATURES[NAMES.index(name)].monotone
             for at in (NEAR, FAR) if name in RANGED else (ANY,):
@@ -157,7 +163,7 @@ def _rounded(values: Array64) -> Array64:
 
 def _design(X: Array64, columns: Sequence[_Column]) -> list[NDArray[np.float32]]:
     """The design matrix (n, parameters) of each alternative. Ramps of ratios below 0 are -1 to 0: 0 is no evidence."""
-    told, far = ~np.isnan(X[:, TELEMETRY]), farness(X[:, RANGE])
+    with_telemetry, far = ~np.isnan(X[:, TELEMETRY]), farness(X[:, RANGE])
     shares = {ANY: np.ones(len(X)), NEAR: 1.0 - far, FAR: far}
     found: list[NDArray[np.float32]] = []
     for alternative in range(len(ALTERNATIVES)):
@@ -166,7 +172,7 @@ def _design(X: Array64, columns: Sequence[_Column]) -> list[NDArray[np.float32]]
             if c.alternative != alternative:
                 continue
             if not c.feature:
-                parts.append((told == (c.low == 1.0)).astype(np.float64))
+                parts.append((with_telemetry == (c.low == 1.0)).astype(np.float64))
                 continue
             x = X[:, NAMES.index(c.feature)]
             missing = np.isnan(x)
@@ -235,7 +241,9 @@ def _left_out_loss(
     return total / float(weight.sum())
 
 
-def _model(columns: Sequence[_Column], theta: Array64, trained: dict[str, Any]) -> DetectorModel:
+def _model(
+    columns: Sequence[_Column], theta: Array64, trained: dict[str, Any], lidar_model: LidarModel
+) -> DetectorModel:
     priors = np.zeros((len(ALTERNATIVES), 2))
     ramps: dict[tuple[int, str, At], list[tuple[_Column, float]]] = {}
     missing: dict[tuple[int, str, At], float] = {}
@@ -262,4 +270,6 @@ def _model(columns: Sequence[_Column], theta: Array64, trained: dict[str, Any]) 
             )
         )
     rounded = tuple((round(without, 4), round(with_, 4)) for without, with_ in priors.tolist())
-    return DetectorModel(feature_version=VERSION, priors=rounded, terms=tuple(terms), trained=trained)
+    return DetectorModel(
+        feature_version=VERSION, lidar_model=lidar_model, priors=rounded, terms=tuple(terms), trained=trained
+    )

@@ -40,6 +40,7 @@ from stages.messages import Candidates, LidarFirings, ServoGoal, ServoState, Tra
 from stages.sweep.turntable import GearPlay
 
 RESULT_NS = 20_000_000  # from a pass to the output about it: PASS_OVER_NS of the tracker, a slice, a servo period
+SLICE_NS = 12_000_000  # longest slice that RESULT_NS includes: 10 ms in whole packets; longer ones delay the output
 MIN_OBSERVATION_NS = 5_000_000
 INITIAL_PASS_S = 0.05  # first estimate of the time to the rotor's next pass
 INNER_RAD = math.radians(8.0)  # beams with a larger elevation are used only when others need much more movement
@@ -57,6 +58,7 @@ class _State:
     rotor: Rotor
     servo_rad: float | None = None
     elevations_rad: tuple[float, ...] = ()
+    slice_ns: int = 0  # length of the last slice
     targets: Targets = field(default_factory=Targets)
     hold_until_ns: int = 0  # end of the planned observation
     current: Key | None = None  # target of the planned observation
@@ -118,8 +120,10 @@ class BeamAim(Stage[BeamAimSettings]):
         return math.radians(self.settings.travel_deg[0]), math.radians(self.settings.travel_deg[1])
 
     def on_firings(self, firings: LidarFirings) -> None:
-        """Update the rotor's azimuth and rate."""
+        """Update the rotor's azimuth and rate, and the length of a slice."""
         self._state.rotor.update(firings)
+        if firings.pulse_stamp_ns.size:
+            self._state.slice_ns = int(firings.pulse_stamp_ns[-1] - firings.pulse_stamp_ns[0])
         if not self._state.elevations_rad:
             self._state.elevations_rad = tuple(sorted(float(w) for w in firings.laser_elevation_rad))
 
@@ -262,7 +266,8 @@ class BeamAim(Stage[BeamAimSettings]):
         del target.missed[:-MAX_MISSED]
         target.observations += 1
         state.track_observations += target.is_track
-        state.hold_until_ns = max(pass_ns + RESULT_NS, servo.stamp_ns + MIN_OBSERVATION_NS)
+        result_ns = RESULT_NS + max(state.slice_ns - SLICE_NS, 0)
+        state.hold_until_ns = max(pass_ns + result_ns, servo.stamp_ns + MIN_OBSERVATION_NS)
         return ServoGoal(stamp_ns=servo.stamp_ns, position_rad=goal_rad, speed_radps=speed_radps)
 
     def _offset_m(self, target: Target, range_m: float, pass_ns: int) -> float:

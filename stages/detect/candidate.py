@@ -32,6 +32,7 @@ SOME_RETURNS_M = 36.0  # over range: counts up to this one are ambiguous, a wire
 SINGLE_RETURN_NATS = -1.0  # threshold of `Candidate.return_count_nats` below which `returns_singly` is true
 STATIC_M = 0.6  # a static object is observed again within this distance
 OPEN_NEIGHBOUR_SCORE = 0.5  # a lower `Candidate.neighbour_score` means open air around it
+WIRE_M, SINGLE_RETURN_WIRE_M = 20.0, 30.0  # to these ranges a wire returns pulses; several a scan pass, and one
 START_SPEED_MPS = 6.0  # one sigma about the vehicle's own velocity
 
 
@@ -242,3 +243,13 @@ class Candidate:
     def moves(self, motion_known: bool) -> bool:
         """Whether it has significantly moved in the map frame; see `stages/detect/flight.py`."""
         return moves(self.path_ns, self.path_m, self.range_m, motion_known)
+
+
+def over_visible_support(c: Candidate, ratios: MotionLogRatios, wire_m: float, single_return_wire_m: float) -> float:
+    """Log ratio [nats] of telemetry over the static object that would be visible at the candidate's range.
+
+    A wire to `wire_m`, or to `single_return_wire_m` if the candidate returns singly. Beyond, a wire returns few pulses
+    or none: a static object.
+    """
+    wire = c.range_m < (single_return_wire_m if c.returns_singly else wire_m)
+    return ratios.over_wire if wire else ratios.over_static

@@ -23,12 +23,12 @@ def candidate_log(
 ) -> CandidateLog:
     """The classified candidates of a slice, each at its last observation."""
     listed = list(classified)
-    seen = [trail.to_vehicle(c.seen_ns, c.path_m[-1], c.velocity_mps)[0] for c in listed]
+    positions_m = [trail.to_vehicle(c.seen_ns, c.path_m[-1], c.velocity_mps)[0] for c in listed]
     return CandidateLog(
         stamp_ns=now_ns,
         candidate_id=np.array([c.number for c in listed], dtype=np.int64),
         seen_ns=np.array([c.seen_ns for c in listed], dtype=np.int64),
-        xyz_vehicle_m=np.array(seen).reshape(-1, 3),
+        xyz_vehicle_m=np.array(positions_m).reshape(-1, 3),
         probability=np.array([probability(c.log_odds) for c in listed], dtype=np.float64),
         features=np.array([c.features for c in listed]),
         feature_names=NAMES,
@@ -65,12 +65,12 @@ def candidates_message(
     undirected_speed_mps = [reported_mps if c.scan_passes == 1 else 0.0 for c in listed]
     spreads_mps = [0.0 if wander else spread_mps for wander in undirected_speed_mps]
     drones = [c.predict_as_drone(now_ns, expected_mps, spread) for c, spread in zip(listed, spreads_mps, strict=True)]
-    seen = [trail.to_vehicle(now_ns, *drone) for drone in drones]
+    positions = [trail.to_vehicle(now_ns, *drone) for drone in drones]
     return Candidates(
         stamp_ns=now_ns,
         candidate_id=np.array([c.number for c in listed], dtype=np.int64),
-        xyz_vehicle_m=np.array([xyz for xyz, _ in seen]).reshape(-1, 3),
-        velocity_vehicle_mps=np.array([v for _, v in seen]).reshape(-1, 3),
+        xyz_vehicle_m=np.array([xyz for xyz, _ in positions]).reshape(-1, 3),
+        velocity_vehicle_mps=np.array([v for _, v in positions]).reshape(-1, 3),
         probability=np.array([probability(c.log_odds) for c in listed], dtype=np.float64),
         seen_ns=np.array([c.seen_ns for c in listed], dtype=np.int64),
         scan_passes=np.array([c.scan_passes for c in listed], dtype=np.int64),
@@ -95,8 +95,8 @@ def detections_message(
     """
     recent = (c for c in table if c.seen_ns >= start_ns or (c.accepted and not c.announced))
     listed = sorted(recent, key=lambda c: (not c.accepted, -c.log_odds))[:at_most]
-    seen = [trail.to_vehicle(c.seen_ns, c.xyz_m, c.velocity_mps) for c in listed]
-    xyz_vehicle_m = np.array([xyz for xyz, _ in seen]).reshape(-1, 3)
+    positions = [trail.to_vehicle(c.seen_ns, c.xyz_m, c.velocity_mps) for c in listed]
+    xyz_vehicle_m = np.array([xyz for xyz, _ in positions]).reshape(-1, 3)
     accepted = sum(c.accepted for c in listed)
     if accepted:
         x, y, z = xyz_vehicle_m[0]
@@ -119,7 +119,7 @@ def detections_message(
             start_ns=start_ns,
             candidate_id=np.array([c.number for c in listed], dtype=np.int64),
             seen_ns=np.array([c.seen_ns for c in listed], dtype=np.int64),
-            velocity_vehicle_mps=np.array([v for _, v in seen]).reshape(-1, 3),
+            velocity_vehicle_mps=np.array([v for _, v in positions]).reshape(-1, 3),
             log_odds=np.array([c.log_odds for c in listed], dtype=np.float64),
             probability=np.array([probability(c.log_odds) for c in listed], dtype=np.float64),
         ),

@@ -31,7 +31,14 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
-from stages.detect.candidate import OPEN_NEIGHBOUR_SCORE, Alternative, Candidate
+from stages.detect.candidate import (
+    OPEN_NEIGHBOUR_SCORE,
+    SINGLE_RETURN_WIRE_M,
+    WIRE_M,
+    Alternative,
+    Candidate,
+    over_visible_support,
+)
 from stages.kernels.detect.isolation import SECTORS
 from stages.kernels.detect.motion_log_ratios import SWAY_M
 
@@ -72,8 +79,8 @@ class ClassifierWeights(BaseModel):
     not_near_m: float = 16.0  # falling to 0 at this range
     max_isolated: float = 2.0
     max_isolated_near: float = 3.0  # additional cap at close range, where a wire would return pulses
-    wire_m: float = 20.0  # a wire returns pulses to this range,
-    unseen_m: float = 30.0  # and none beyond this one
+    wire_m: float = WIRE_M  # a wire returns pulses to this range,
+    unseen_m: float = SINGLE_RETURN_WIRE_M  # and none beyond this one
     max_single: float = 6.0  # cap of single returns: a wire gives little else
     max_multiple: float = 2.0  # cap of several returns
     near_large: float = 8.0  # penalty: a wall, crown or trunk is near, and the candidate has not moved away
@@ -224,8 +231,7 @@ def over_clutter(c: Candidate, e: ClassifierWeights, free_space: bool, motion_kn
         kinds.append("longer than a drone")
         remarks.append(kinds[-1])
     if c.log_ratios is not None:
-        wire = c.range_m < (e.unseen_m if c.returns_singly else e.wire_m)  # beyond, a wire returns few pulses or none
-        nats = c.log_ratios.over_wire if wire else c.log_ratios.over_static
+        nats = over_visible_support(c, c.log_ratios, e.wire_m, e.unseen_m)
         displaced = c.log_ratios.displacement_m > c.apparent_motion_m
         nats = max(telemetry_nats(nats, e, displaced), telemetry_nats(c.flight_log_ratio, e))
         moved = nats > MOVED_NATS

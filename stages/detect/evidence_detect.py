@@ -33,7 +33,7 @@ from stages.detect.isolation import LargeObjectMap
 from stages.detect.observations import ObservationFinder, ObservationLimits, Slice
 from stages.detect.reacquire import reacquired_candidate, without_duplicates
 from stages.detect.telemetry import DetectorTelemetry
-from stages.detect.trained.existence import FalseReturns, birth_nats, passed_nats
+from stages.detect.trained.existence import FalseReturns, birth_nats, passed_nats, range_share
 from stages.detect.trained.features import features_of
 from stages.detect.trained.model import DetectorModel
 from stages.geometry.frames import Array64
@@ -121,6 +121,11 @@ class EvidenceDetectSettings(Settings):
     def _settings_agree(self) -> EvidenceDetectSettings:
         if self.furthest_m <= self.nearest_m:
             raise ValueError("furthest_m must be larger than nearest_m")
+        if self.model is not None and self.model.lidar_model != self.unit.model:
+            raise ValueError(
+                f"the trained model is for the {self.model.lidar_model}, not for the {self.unit.model}: train one on "
+                "runs with it (`grd train-detector`), or set `model: null` for the classifier by `weights`"
+            )
         return self
 
 
@@ -284,7 +289,7 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
                 if watch.returns == 0 and now_ns - c.seen_ns > 2 * SAME_PASS_NS:
                     c.passed_pulses += watch.pass_throughs
                     c.existence_nats += passed_nats(c.range_m, watch.pass_throughs)
-                    c.missed_returns += watch.pass_throughs * min(1.0, (35.0 / c.range_m) ** 2)
+                    c.missed_returns += watch.pass_throughs * range_share(c.range_m)
                     self._classify(now, c)
                     now.table.put(c)
                 del now.watches[c.number]

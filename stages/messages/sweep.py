@@ -20,7 +20,7 @@ class SweptPoints(Message):
     xyz_vehicle_m: Points32
     laser: PerPointU8
     reflectivity: PerPointU8
-    servo_rad: PerPointF32  # turntable angle at the pulse, after sign, zero and time offset
+    turntable_rad: PerPointF32  # turntable angle at the pulse, after sign, zero and time offset
     pulses: int  # laser pulses fired in this slice, including those without a return
     origin_vehicle_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # origin of the beams, mid-slice
     unplaced: int = 0  # returns omitted because the turntable angle at their time is not known

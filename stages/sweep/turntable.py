@@ -147,7 +147,7 @@ class Turntable:
             xyz_vehicle_m=returns.xyz_m[:placed],
             laser=returns.laser[:placed],
             reflectivity=returns.reflectivity[:placed],
-            servo_rad=returns.turntable_rad[:placed],
+            turntable_rad=returns.turntable_rad[:placed],
             pulses=fired,
             origin_vehicle_m=origin,
             unplaced=unplaced,

@@ -145,7 +145,7 @@ class MeanShiftTrack(Stage[MeanShiftTrackSettings]):
                     xyz_vehicle_m=points.xyz_vehicle_m[near],
                     laser=points.laser[near],
                     reflectivity=points.reflectivity[near],
-                    servo_rad=points.servo_rad[near],
+                    turntable_rad=points.turntable_rad[near],
                     pulses=points.pulses,
                     origin_vehicle_m=points.origin_vehicle_m,
                 )

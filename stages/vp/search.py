@@ -116,7 +116,8 @@ def _frames(lines: Lines, axes: Array64, limits: SearchLimits) -> tuple[list[flo
     """Yaws of the significant horizontal pairs relative to `axes`, the axes of the best pair.
 
     Also returns the score of the first. A further pair must stand out without the lines of any 90 deg of azimuth, in
-    which a board, a car or a shelf lies; and each of its directions by itself: shadows and hoses have only one.
+    which a board, a car or a shelf lies; and each of its directions by itself: an object such as a shadow edge
+    has one direction only.
     """
     free = ~_along_vertical(lines, axes[:, 2], limits)
     yaws: list[float] = []

@@ -53,7 +53,7 @@ def swept(xyz_vehicle_m, stamp_ns, laser=0, origin_vehicle_m=(0.0, 0.0, 0.0)) ->
         xyz_vehicle_m=xyz,
         laser=np.broadcast_to(np.asarray(laser, dtype=np.uint8), (len(xyz),)).copy(),
         reflectivity=np.zeros(len(xyz), dtype=np.uint8),
-        servo_rad=np.zeros(len(xyz), dtype=np.float32),
+        turntable_rad=np.zeros(len(xyz), dtype=np.float32),
         pulses=max(len(xyz), 1),
         origin_vehicle_m=origin_vehicle_m,
     )

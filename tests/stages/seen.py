@@ -92,7 +92,7 @@ def lidar_slice(
         xyz_vehicle_m=xyz.astype(np.float32),
         laser=np.zeros(count, np.uint8),
         reflectivity=np.zeros(count, np.uint8),
-        servo_rad=np.zeros(count, np.float32),
+        turntable_rad=np.zeros(count, np.float32),
         pulses=count,
     )
 

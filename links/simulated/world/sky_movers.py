@@ -51,67 +51,68 @@ def draw_sky(rng: Generator, count: int, height_m: tuple[float, float] = (3.0, 2
     )  # fmt: skip
     for kind in rng.integers(0, len(kinds), count):
         angle, far = rng.uniform(0, 2 * np.pi), rng.uniform(*NEAR_M)
-        place = np.array([far * np.cos(angle), far * np.sin(angle), rng.uniform(*height_m)])
-        yield from kinds[kind](rng, place)
+        position = np.array([far * np.cos(angle), far * np.sin(angle), rng.uniform(*height_m)])
+        yield from kinds[kind](rng, position)
 
 
-def _glider(rng: Generator, place: Array64, flap: float = 0.4) -> Iterator[PathMover]:
+def _glider(rng: Generator, position: Array64, flap: float = 0.4) -> Iterator[PathMover]:
     span = rng.uniform(0.25, 1.1)
     velocity = _velocity(rng, rng.uniform(2.0, 8.0), rng.normal(0, 0.3))
-    yield _bird(span, _straight(rng, place, velocity), 8.5, rng.uniform(2, 6) if rng.uniform() < flap else 0.0)
+    yield _bird(span, _straight(rng, position, velocity), 8.5, rng.uniform(2, 6) if rng.uniform() < flap else 0.0)
 
 
-def _circling(rng: Generator, place: Array64) -> Iterator[PathMover]:
+def _circling(rng: Generator, position: Array64) -> Iterator[PathMover]:
     radius, speed, turn = rng.uniform(3.0, 14.0), rng.uniform(3.0, 9.0), rng.choice([-1.0, 1.0])
     t = np.arange(0.0, LASTS_S, min(KNOT_S, radius / speed / 2))
     angle = turn * speed / radius * t + rng.uniform(0, 2 * np.pi)
     circle = radius * np.column_stack([np.cos(angle), np.sin(angle), np.zeros(len(t))])
-    points = place + circle + np.outer(t, [0.0, 0.0, rng.uniform(-0.3, 0.5)])
+    points = position + circle + np.outer(t, [0.0, 0.0, rng.uniform(-0.3, 0.5)])
     yield _bird(rng.uniform(0.3, 1.2), _path(t, points, angle + turn * np.pi / 2), 10.0, rng.uniform(0, 3))
 
 
-def _kestrel(rng: Generator, place: Array64) -> Iterator[PathMover]:
+def _kestrel(rng: Generator, position: Array64) -> Iterator[PathMover]:
     """Hovers into the wind, shifts to another position now and then."""
     t = np.arange(0.0, LASTS_S, KNOT_S)
     step = rng.normal(0, 0.12, (len(t), 3)) + (rng.uniform(size=(len(t), 1)) < 0.08) * rng.normal(0, 3.0, (len(t), 3))
-    points = place + np.cumsum(step, axis=0)
+    points = position + np.cumsum(step, axis=0)
     yaw = np.full(len(t), rng.uniform(0, 6))
     yield _bird(rng.uniform(0.35, 0.8), _path(t, points, yaw), 12.0, rng.uniform(4, 8))
 
 
-def _flock(rng: Generator, place: Array64) -> Iterator[PathMover]:
+def _flock(rng: Generator, position: Array64) -> Iterator[PathMover]:
     span, velocity, beat = rng.uniform(0.25, 0.9), _velocity(rng, rng.uniform(4.0, 13.0), 0.0), rng.uniform(0, 6)
     start_s = rng.uniform(1, 14)
     for _ in range(rng.integers(3, 8)):
         offset = rng.normal(0, [2.0, 2.0, 1.0])
-        yield _bird(span, _straight(rng, place + offset, velocity + rng.normal(0, 0.2, 3), start_s), 14.5, beat)
+        yield _bird(span, _straight(rng, position + offset, velocity + rng.normal(0, 0.2, 3), start_s), 14.5, beat)
 
 
-def _insect(rng: Generator, place: Array64) -> Iterator[PathMover]:
-    near = place * rng.uniform(2.0, 5.0) / np.linalg.norm(place)
+def _insect(rng: Generator, position: Array64) -> Iterator[PathMover]:
+    near = position * rng.uniform(2.0, 5.0) / np.linalg.norm(position)
     t = np.arange(0.0, LASTS_S, 0.5)
     points = near + np.cumsum(rng.normal(0, 0.4, (len(t), 3)), axis=0) * [1, 1, 0.5]
     points[:, 2] = np.maximum(points[:, 2], 0.8)
     yield PathMover("insect", (box((-0.012, -0.01, -0.01), (0.012, 0.01, 0.01), "feather"),), _path(t, points), 6.0)
 
 
-def _kite(rng: Generator, place: Array64) -> Iterator[PathMover]:
+def _kite(rng: Generator, position: Array64) -> Iterator[PathMover]:
     s = rng.uniform(0.4, 0.9)
     diamond = quads([[(0, -0.6 * s, 0), (-0.5 * s, 0, -s), (0, 0.6 * s, 0), (0.3 * s, 0, 0.6 * s)]], "latex")
-    yield PathMover("kite", (diamond,), _swaying(rng, place + np.array([0.0, 0.0, 5.0]), rng.uniform(0.5, 2.5)), 10.0)
+    path = _swaying(rng, position + np.array([0.0, 0.0, 5.0]), rng.uniform(0.5, 2.5))
+    yield PathMover("kite", (diamond,), path, 10.0)
 
 
-def _bag(rng: Generator, place: Array64) -> Iterator[PathMover]:
+def _bag(rng: Generator, position: Array64) -> Iterator[PathMover]:
     s = rng.uniform(0.15, 0.3)
     bag = box((-s, -0.6 * s, -s), (0.7 * s, 0.8 * s, s), "latex", taper=0.4)
-    path = _straight(rng, place, _velocity(rng, rng.uniform(0.5, 4.0), rng.normal(0, 0.5)), wander_m=0.6)
+    path = _straight(rng, position, _velocity(rng, rng.uniform(0.5, 4.0), rng.normal(0, 0.5)), wander_m=0.6)
     yield PathMover("bag", (bag,), path, 8.0)
 
 
-def _balloon(rng: Generator, place: Array64) -> Iterator[PathMover]:
+def _balloon(rng: Generator, position: Array64) -> Iterator[PathMover]:
     velocity = _velocity(rng, rng.uniform(0.3, 4.0), rng.uniform(0.2, 1.6))
     free = rng.uniform() < 0.5
-    path = _straight(rng, place, velocity, wander_m=0.3) if free else _swaying(rng, place, rng.uniform(0.2, 0.8))
+    path = _straight(rng, position, velocity, wander_m=0.3) if free else _swaying(rng, position, rng.uniform(0.2, 0.8))
     yield PathMover("balloon", (balloon_mesh(rng.uniform(0.28, 0.6)),), path, 8.0)
 
 
@@ -127,19 +128,19 @@ def _velocity(rng: Generator, speed_mps: float, up_mps: float) -> Array64:
 
 
 def _straight(
-    rng: Generator, place: Array64, velocity: Array64, at_s: float | None = None, wander_m: float = 0.0
+    rng: Generator, position: Array64, velocity: Array64, at_s: float | None = None, wander_m: float = 0.0
 ) -> Path:
-    """A straight path that passes `place` at `at_s`, at most 40 m high and at least 1 m above the camera."""
+    """A straight path that passes `position` at `at_s`, at most 40 m high and at least 1 m above the camera."""
     t = np.array([0.0, LASTS_S]) if wander_m == 0.0 else np.arange(0.0, LASTS_S, KNOT_S)
-    points = place + np.outer(t - (rng.uniform(0.0, 15.0) if at_s is None else at_s), velocity)
+    points = position + np.outer(t - (rng.uniform(0.0, 15.0) if at_s is None else at_s), velocity)
     points += np.cumsum(rng.normal(0, max(wander_m, 1e-12), points.shape), axis=0)
     points[:, 2] = np.clip(points[:, 2], 1.0, 40.0)
     return _path(t, points, np.full(len(t), np.arctan2(velocity[1], velocity[0])))
 
 
-def _swaying(rng: Generator, place: Array64, sway_m: float) -> Path:
+def _swaying(rng: Generator, position: Array64, sway_m: float) -> Path:
     t = np.arange(0.0, LASTS_S, KNOT_S)
-    return _path(t, place + rng.normal(0, sway_m, (len(t), 3)) * [1, 1, 0.4])
+    return _path(t, position + rng.normal(0, sway_m, (len(t), 3)) * [1, 1, 0.4])
 
 
 def _path(t_s: Array64, points_m: Array64, yaw_rad: Array64 | None = None) -> Path:

@@ -1,14 +1,16 @@
-"""Bernoulli existence of one object behind a candidate's observations, recursively from the first return.
+"""Probability that one object causes a candidate's observations (Bernoulli filter).
 
-In log-odds L, with kappa [1/m^3] the density of false observations per scan pass at that range:
+Recursively from the first return, in log-odds L, with kappa [1/m^3] the density of false observations per scan pass at
+that range:
 
     birth           L = ln(births / kappa),  births: objects that appear in a scan pass, per m^3
     survival        P(exists) *= exp(-dt / LIFETIME_S)
     observation     L += ln(p_D N(innovation; S) / kappa)
     pass-throughs   L += ln(1 - p_D),  p_D = 1 - (1 - q)^pulses,  q: a pulse through the middle of a drone returns
 
-kappa is measured: candidates that were observed once only, by range, in the last seconds (`FalseReturns`). It is high
-in rain and near trees.
+kappa is measured by range over the last seconds (`FalseReturns`): observations that begin no candidate, also those of
+static objects, and candidates that are not observed again. It is high in rain and near trees. An observation's returns
+are the lower limit of its pulses in p_D.
 
 Source: Ristic, Vo, Vo, Farina, "A tutorial on Bernoulli filters", IEEE TSP 61 (2013), Equations 22 to 28; ours.
 """
@@ -22,16 +24,16 @@ import numpy as np
 SHELL_M = 4.0  # of the range histogram of false returns
 SHELLS = 32
 MEMORY_S = 6.0  # false returns count for this long (1 / e)
-PASS_S = 0.1  # between scan passes
+PASS_S = 0.1  # between scan passes: 600 rpm; see `DetectorModel.lidar_model`
 LIFETIME_S = 30.0  # assumed mean time that an object stays in view
 BIRTHS_PER_S = 0.02  # assumed: one object appears in the sky in 50 s
 LEAST_FALSE_PER_S = 0.05  # false returns of a clear sky, per shell: the prior of the histogram
-RETURNS_AT_MIDDLE = 0.6  # of the pulses through the middle of a drone: gaps pass the rest, as in track/hull.py
+RETURNS_AT_MIDDLE = 0.6  # of the pulses through the middle of a drone: assumed; the track estimates its own
 RETURNS_TO_M = 35.0  # a dark drone returns them to this range, fewer by the inverse square beyond
 
 
 class FalseReturns:
-    """Rate of objects that were observed once only, by range: false returns, rain drops, leaves."""
+    """Rate of observations that belong to no candidate, by range: false returns, rain drops, leaves, static objects."""
 
     def __init__(self) -> None:
         self._count, self._stamp_ns = np.zeros(SHELLS), 0
@@ -67,12 +69,15 @@ def survived_nats(nats: float, dt_s: float) -> float:
     return math.log(exists / (1.0 - exists))
 
 
-def observed_nats(distance2_m2: float, variance_m2: float, range_m: float, pulses: int, false_per_s: float) -> float:
-    """Log ratio of an observation at this squared distance from a prediction with this variance on each axis."""
+def observed_nats(distance2_m2: float, variance_m2: float, range_m: float, returns: int, false_per_s: float) -> float:
+    """Log ratio of an observation at this squared distance from a prediction with this variance on each axis.
+
+    `returns`: of the observation; a lower limit of the pulses of p_D, so that the ratio is one, too.
+    """
     volume_m3 = 2.0 * math.pi * range_m**2 * SHELL_M
     expected = false_per_s * PASS_S / volume_m3
     density = math.exp(-0.5 * distance2_m2 / variance_m2) / (2.0 * math.pi * variance_m2) ** 1.5
-    return math.log(max(detection_probability(range_m, max(pulses, 1)) * density, 1e-12) / expected)
+    return math.log(max(detection_probability(range_m, max(returns, 1)) * density, 1e-12) / expected)
 
 
 def passed_nats(range_m: float, pulses: float) -> float:
@@ -86,4 +91,9 @@ def detection_probability(range_m: float, pulses: float) -> float:
 
 
 def _returned(range_m: float) -> float:
-    return RETURNS_AT_MIDDLE * min(1.0, (RETURNS_TO_M / range_m) ** 2)
+    return RETURNS_AT_MIDDLE * range_share(range_m)
+
+
+def range_share(range_m: float) -> float:
+    """Share of its pulses that a dark drone returns at a range, relative to those at close range."""
+    return min(1.0, (RETURNS_TO_M / range_m) ** 2)

@@ -3,7 +3,10 @@
 `features_of` is a pure function of a candidate's history. A feature that is not available (no telemetry, too few
 observations for a speed) is NaN. VERSION changes with the list or the meaning of a feature.
 
-Source: ours; issue "Detection that holds in any sky".
+Features depend on the classifier of the run, which decides which candidates are kept and counted. Train on replays with
+the classifier that the model replaces, then again on replays with the model.
+
+Source: ours.
 """
 
 from __future__ import annotations
@@ -13,15 +16,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stages.detect.candidate import Candidate
+from stages.detect.candidate import SINGLE_RETURN_WIRE_M, WIRE_M, Candidate, over_visible_support
 from stages.detect.flight import Motion, straight_flight
 from stages.detect.motion_log_ratios import MotionLogRatios
 from stages.geometry.frames import Array64
 
 VERSION = 2
-PULSE_RAD = math.radians(0.2)  # between two pulses of a laser, 600 rpm
+PULSE_RAD = math.radians(0.2)  # between two pulses of a laser: VLP-16, 600 rpm; see `DetectorModel.lidar_model`
 NONE_M = 4.0  # written where no large object is near
-WIRE_M, SINGLE_RETURN_WIRE_M = 20.0, 30.0  # to these ranges a wire returns pulses; several a scan pass, and one
 NOT_DISPLACED_NATS = 3.0  # cap of the log ratio over a static object that may seem to move as far
 
 
@@ -164,9 +166,8 @@ def displaced(c: Candidate, ratios: MotionLogRatios) -> tuple[float, float]:
     A lamp whose pole is invisible, or a wire, may seem to move (`Candidate.apparent_motion_m`): a drone's odometry that
     moved less is little evidence, unless the candidate agreed with it in open air before.
     """
-    wire = c.range_m < (SINGLE_RETURN_WIRE_M if c.returns_singly else WIRE_M)
     beyond_m = ratios.displacement_m - c.apparent_motion_m
-    nats = ratios.over_wire if wire else ratios.over_static
+    nats = over_visible_support(c, ratios, WIRE_M, SINGLE_RETURN_WIRE_M)
     return max(nats if beyond_m > 0.0 else min(nats, NOT_DISPLACED_NATS), c.flight_log_ratio), beyond_m
 
 

@@ -28,6 +28,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from stages.detect.candidate import Alternative, Candidate
 from stages.detect.trained.features import FEATURES, NAMES, RANGE, TELEMETRY, VERSION
 from stages.geometry.frames import Array64
+from stages.geometry.lidar_models import LidarModel
 from stages.kernels.detect.model import evaluate
 
 ALTERNATIVES = tuple(Alternative)
@@ -45,8 +46,8 @@ def farness(range_m: Any) -> Any:
     return np.clip((range_m - NEAR_M) / (FAR_M - NEAR_M), 0.0, 1.0)
 
 
-class Answer(NamedTuple):
-    """What the model says of a candidate."""
+class Prediction(NamedTuple):
+    """The model's result for a candidate."""
 
     log_odds: float  # of a drone
     alternative: int  # the most probable one, an index of ALTERNATIVES
@@ -80,6 +81,7 @@ class DetectorModel(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     feature_version: int
+    lidar_model: LidarModel = "VLP-16"  # of the runs: return_ratio, existence_nats and scan passes depend on it
     priors: tuple[tuple[float, float], ...]  # of each alternative, without and with telemetry [nats]
     terms: tuple[Term, ...] = Field(min_length=1)
     trained: dict[str, Any] = {}  # command, data, versions, held-out scores: for people
@@ -107,31 +109,31 @@ class DetectorModel(BaseModel):
             knots[row, : len(term.knots)], values[row, : len(term.knots)] = term.knots, term.values
         return np.array(where, dtype=np.int64), knots, values, np.array([term.missing for term in self.terms])
 
-    def answer(self, features: Array64) -> Answer:
+    def predict(self, features: Array64) -> Prediction:
         """Log-odds of a drone for features (len(FEATURES),)."""
         compared = not math.isnan(features[TELEMETRY])
         over = np.array([prior[compared] for prior in self.priors])
         contributions = np.zeros((len(ALTERNATIVES), len(NAMES)))
         log_odds = evaluate(*self._tables, features, farness(features[RANGE]), over, contributions)
-        return Answer(log_odds, int(np.argmin(over)), contributions[0])
+        return Prediction(log_odds, int(np.argmin(over)), contributions[0])
 
     def classify(self, c: Candidate) -> tuple[float, str]:
         """Log-odds that the candidate is a drone by its `features`, and the reasons; see `classifier.classify`.
 
         Sets `c.alternative` and `c.rejection`.
         """
-        answer = self.answer(c.features)
-        c.alternative = ALTERNATIVES[answer.alternative]
+        prediction = self.predict(c.features)
+        c.alternative = ALTERNATIVES[prediction.alternative]
         c.rejection = c.alternative.value
-        return answer.log_odds, reasons_of(c.features, answer)
+        return prediction.log_odds, reasons_of(c.features, prediction)
 
 
-def reasons_of(features: Array64, answer: Answer) -> str:
+def reasons_of(features: Array64, prediction: Prediction) -> str:
     """The largest contributions as text, with the values of their features, and what it is if not a drone."""
-    order: list[int] = np.argsort(-np.abs(answer.contributions), kind="stable")[:REASONS].tolist()
-    nats = {k: float(answer.contributions[k]) for k in order if abs(answer.contributions[k]) >= LEAST_NATS}
+    order: list[int] = np.argsort(-np.abs(prediction.contributions), kind="stable")[:REASONS].tolist()
+    nats = {k: float(prediction.contributions[k]) for k in order if abs(prediction.contributions[k]) >= LEAST_NATS}
     reasons = [_reason(FEATURES[k].text, float(features[k]), value) for k, value in nats.items()]
-    return "; ".join([*reasons, f"if not a drone: {ALTERNATIVES[answer.alternative].value}"])
+    return "; ".join([*reasons, f"if not a drone: {ALTERNATIVES[prediction.alternative].value}"])
 
 
 def _reason(text: str, value: float, nats: float) -> str:

@@ -5,15 +5,15 @@ blocks of duration T and squared residuals q, the density is the root of q T / (
 white: an autopilot filters its samples (20 Hz), and the rotors shake it at lower frequencies. What counts is the
 density at the frequencies that pass an integration. In the log of a flight (Pixhawk, 50 Hz) the residuals of single
 samples about a curve of 0.22 s, which contain frequencies above some 6 Hz, state half of it: 0.07 to 0.09 instead of
-0.13 to 0.15 m/s^2/sqrt(Hz) at 3 to 8 Hz; with it the NEES of the heading by IMU was 2.3, with this one it is 1.1.
+0.13 to 0.15 m/s^2/sqrt(Hz) at 3 to 8 Hz.
 
-A window of 0.4 s lets motion below some 3 Hz pass into the parabola: manoeuvres are not noise. The variance is averaged
-with the time constant `average_s`; one window counts at most as LARGEST times the average, because a gust or a
-touch-down is not vibration. Vibration may be a tone: one that is aliased to below 3 Hz is not seen here and acts as a
-bias.
+A window of 0.44 s (twice `noise_window_s`) lets motion below some 3 Hz pass into the parabola: manoeuvres are not
+noise. The variance is averaged with the time constant `average_s`; one window counts at most as LARGEST times the
+average, because a gust or a touch-down is not vibration. Vibration may be a tone: one that is aliased to below 3 Hz is
+not seen here and acts as a bias.
 
-Single samples contain what blocks average out, tones of the rotors above 10 Hz, which thrust may move to any alias. The
-larger one of both densities counts (inertial_motion.py).
+Single samples contain what blocks average out, tones of the rotors above 10 Hz, which thrust may move to any alias.
+The larger of the two densities counts, of single samples and of blocks (inertial_motion.py).
 
 Source: ours; A. Savitzky, M. J. E. Golay, "Smoothing and Differentiation of Data by Simplified Least Squares
 Procedures", 1964; cut-off frequency by R. W. Schafer, "What Is a Savitzky-Golay Filter?", IEEE SPM 28(4), 2011.

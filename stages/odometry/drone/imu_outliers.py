@@ -2,11 +2,13 @@
 
 A sample is false if it is farther from the median of the last SAMPLES, its own included, than FACTOR times the median
 of such distances (the noise) and the change that a drone is capable of since the middle of these samples. A real change
-persists and is the median itself from its third sample on; the two before are lost.
+persists and is the median itself from its third sample on; the two before are lost. At 10 Hz a real step drops two
+samples: the gap of 0.3 s ends the segment.
 
-Source: ours; F. R. Hampel, "The Influence Curve and Its Role in Robust Estimation", 1974. CHANGE of the rate: ArduPilot
-ATC_ACCEL_R_MAX 1100 deg/s^2. In the log of a flight (Pixhawk, two IMUs, 50 Hz, 310 s in flight) 1 of 30 900 samples is
-false: the distances are at most 8.3 m/s^2 (median 1.0) and 0.5 rad/s (0.05); of the touch-down four are left out.
+Source: ours; F. R. Hampel, "The Influence Curve and Its Role in Robust Estimation", 1974. CHANGE of the force:
+assumed; of the rate: ArduPilot ATC_ACCEL_R_MAX 1100 deg/s^2. In the log of a flight (Pixhawk, two IMUs, 50 Hz, 310 s in
+flight) 1 of 30 900 samples is false: the distances are at most 8.3 m/s^2 (median 1.0) and 0.5 rad/s (0.05); of the
+touch-down four are left out.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ from stages.geometry.frames import Array64
 
 SAMPLES, DISTANCES = 5, 25
 FACTOR = 8.0
-CHANGE = np.array([20.0, 20.0])  # [m/s^3], [rad/s^2]
+CHANGE = np.array([20.0, 20.0])  # [m/s^3] assumed, [rad/s^2]
 
 
 class FalseSamples:

@@ -96,7 +96,7 @@ class InertialMotion(Stage[InertialMotionSettings]):
         if not 0 < dt_ns <= 1e9 * self.settings.longest_gap_s:
             self._segment += 1
             return self._begin(imu)
-        if self._is_false(imu):
+        if self._add_to_outlier_check(imu):
             self._counts["false samples"] += 1
             return None
         force = 0.5 * (last.acceleration_drone_mps2 + imu.acceleration_drone_mps2)
@@ -120,10 +120,11 @@ class InertialMotion(Stage[InertialMotionSettings]):
         for noise in self._noise:
             noise.new_segment()
         self._false.new_segment()
-        self._is_false(imu)
+        self._add_to_outlier_check(imu)  # too few samples to be false
         self._add(imu)
 
-    def _is_false(self, imu: DroneImu) -> bool:
+    def _add_to_outlier_check(self, imu: DroneImu) -> bool:
+        """Add a sample to the last ones. True: it is false."""
         return self._false.add(imu.stamp_ns, imu.acceleration_drone_mps2, imu.angular_velocity_drone_radps)
 
     def _add(self, imu: DroneImu) -> None:

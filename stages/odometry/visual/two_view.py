@@ -66,7 +66,7 @@ class Noise:
 
     least_rad: float  # minimum, independent per track
     shared_rad: float  # common to all tracks: it does not average out
-    correlation: float = 1.0  # measured over independent sigma of a motion: errors of neighbouring tracks are alike
+    correlation: float = 1.0  # actual over independent sigma of a motion: errors of neighbouring tracks are alike
     lens_share: float = 0.0  # common error of the lens, as a share of the rotation
     parallax_share: float = 0.0  # common error of the rotation by parallax, as a share: moving things, warped templates
     direction_rad: float = 0.0  # common error of the direction of translation

@@ -14,7 +14,7 @@ from flow.link import LinkError
 from links.cli.app import app
 from links.evaluation.text_files import NO_DRONE
 from links.runs import results
-from links.training.candidates import FIRST_ROWS, read_candidates
+from links.training.candidates import FIRST_ROWS, lidar_model_of, read_candidates
 from links.training.fit import scores, train
 from stages.detect.trained.features import FEATURES, NAMES
 from stages.detect.trained.model import DetectorModel
@@ -80,7 +80,7 @@ def test_a_run_without_a_drone_has_no_drones(tmp_path, runs):
 def test_the_model_separates_what_differs_and_is_calibrated_by_other_seeds(runs):
     rows = read_candidates(runs)
     model = train(rows, {})
-    p = np.array([1 / (1 + math.exp(-model.answer(x).log_odds)) for x in rows.X])
+    p = np.array([1 / (1 + math.exp(-model.predict(x).log_odds)) for x in rows.X])
     assert p[rows.is_drone].mean() > 0.85 > 0.2 > p[~rows.is_drone].mean()
     assert p.mean() == pytest.approx(rows.is_drone.mean(), abs=0.03)
     assert all(score.brier < 0.12 for score in scores(rows, p))
@@ -98,7 +98,7 @@ def test_a_feature_left_out_is_not_used(runs):
     model = train(read_candidates(runs), {}, ["top_mps"])
     x = np.zeros(len(NAMES))
     faster = np.where([f.name == "top_mps" for f in FEATURES], 50.0, x)
-    assert model.answer(x).log_odds == model.answer(faster).log_odds
+    assert model.predict(x).log_odds == model.predict(faster).log_odds
 
 
 def test_the_command_writes_a_file_that_the_configuration_takes_and_that_is_reproduced(runs, tmp_path):
@@ -110,11 +110,51 @@ def test_the_command_writes_a_file_that_the_configuration_takes_and_that_is_repr
         result = CliRunner().invoke(app, arguments)
         assert result.exit_code == 0, result.output
     assert "with telemetry" in result.output
-    model = yaml.safe_load(files[0].read_text())["stages"]["detect"]["config"]["model"]
-    assert model == yaml.safe_load(files[1].read_text())["stages"]["detect"]["config"]["model"]
+    model, again = (yaml.safe_load(file.read_text())["stages"]["detect"]["config"]["model"] for file in files)
+    commands = [one["trained"].pop("command") for one in (model, again)]
+    assert model == again
+    assert [command.replace("two.yaml", "one.yaml") for command in commands] == commands[:1] * 2
     trained = DetectorModel.model_validate(model).trained
     assert trained["seeds"] == [1, 2]
     assert trained["held_out"][0]["log_loss"] < trained["held_out"][0]["logged_log_loss"]
+
+
+def test_the_file_names_the_options_of_the_command_also_for_many_runs(tmp_path):
+    many = [write_run(tmp_path / "runs" / f"a-s{seed}-b", seed, candidates=12, rows=5) for seed in range(1, 13)]
+    write_run(tmp_path / "held" / "a-s20-b", 20, candidates=12)
+    file, held = tmp_path / "one.yaml", str(tmp_path / "held")
+    options = ["-o", str(file), "--held-out", held, "--without", "top_mps", "--without", "misfit"]
+    result = CliRunner().invoke(app, ["train-detector", *map(str, many), *options])
+    assert result.exit_code == 0, result.output
+    trained = yaml.safe_load(file.read_text())["stages"]["detect"]["config"]["model"]["trained"]
+    assert trained["command"] == f"grd train-detector RUNS (12) {' '.join(options)}"
+
+
+def test_a_penalty_at_the_end_of_those_tried_is_a_warning(runs, tmp_path, monkeypatch):
+    for tried, expected in (((1e5, 1e6), True), ((1e-3, 1.0, 1e6), False)):
+        monkeypatch.setattr("links.training.fit.STRENGTHS", tried)
+        arguments = ["train-detector", *map(str, runs[:2]), "-o", str(tmp_path / "one.yaml")]
+        result = CliRunner().invoke(app, arguments)
+        assert result.exit_code == 0, result.output
+        assert ("is at an end of those tried" in result.output) == expected
+
+
+def test_the_model_is_for_the_lidar_of_its_runs(tmp_path):
+    folders = [write_run(tmp_path / f"a-s{seed}-b", seed, candidates=12) for seed in (1, 2)]
+    assert lidar_model_of(folders) == "VLP-16"
+    (folders[0] / "config.yaml").write_text("rig: {lidar: {model: XT16}}\n")
+    assert lidar_model_of(folders[:1]) == "XT16"
+    assert train(read_candidates([*folders, write_run(tmp_path / "a-s3-b", 3)]), {}, (), "XT16").lidar_model == "XT16"
+    with pytest.raises(LinkError, match="different LiDARs"):
+        lidar_model_of(folders)
+    (folders[0] / "config.yaml").write_text("rig: {lidar: {model: XT99}}\n")
+    with pytest.raises(LinkError, match=r"config.yaml: .*"):
+        lidar_model_of(folders)
+
+
+def test_a_run_without_a_seed_in_its_name_is_refused(tmp_path):
+    with pytest.raises(LinkError, match="must contain the seed"):
+        read_candidates([write_run(tmp_path / "park-20m-hover", 1)])
 
 
 def test_runs_that_cannot_be_used_are_named(tmp_path, runs):

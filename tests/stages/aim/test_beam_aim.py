@@ -21,6 +21,7 @@ from tests.stages.made import MS, ON_ITS_SIDE, PACKET_NS, START_NS, servo
 
 TICK_NS = 5 * MS  # 200 servo states a second
 LATENCY_S = 0.03  # from a goal to the servo's first move
+PULSE_ARRAYS = ("pulse_stamp_ns", "laser", "azimuth_rad", "range_m", "reflectivity", "return_kind", "xyz_lidar_m")
 LIMIT_RADPS = 55 * math.tau / 60
 
 
@@ -542,6 +543,22 @@ def test_tracks_have_priority_over_candidates():
 
     missed = fly(BeamAim(mount=ON_ITS_SIDE), 3.0, publish).missed_m(trajectory)[10:]
     assert np.mean(missed < 0.2) > 0.85
+
+
+def test_an_observation_is_held_longer_when_slices_are_longer():
+    """Its output comes at the end of the slice."""
+    held_ms = {}
+    for count in (1, 8, 38):
+        aim, trajectory = BeamAim(mount=ON_ITS_SIDE), towards(80.0, 45.0)
+        end_ns = START_NS + 38 * PACKET_NS
+        packets = [packet(end_ns - k * PACKET_NS + PULSE_NS, np.zeros(384)) for k in range(count, 0, -1)]
+        arrays = {name: [getattr(p, name) for p in packets] for name in PULSE_ARRAYS}
+        aim.on_firings(replace(packets[0], **{name: np.concatenate(parts) for name, parts in arrays.items()}))
+        aim.on_state(track_state(trajectory, 0.05))
+        goals_ms = [ms for ms in range(400) if aim.on_servo(servo(end_ns + ms * MS, 0.3)) is not None]
+        held_ms[count] = goals_ms[1] - goals_ms[0]
+    assert held_ms[1] == held_ms[8]
+    assert held_ms[38] - held_ms[8] == pytest.approx(38 * PACKET_NS / MS - 12, abs=1.0)
 
 
 def test_the_goals_stay_within_a_narrow_travel():

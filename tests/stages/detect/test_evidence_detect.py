@@ -690,6 +690,18 @@ def test_impossible_settings_are_rejected(settings):
         EvidenceDetect(**settings)
 
 
+def test_a_trained_model_is_refused_for_another_lidar():
+    model = {
+        "feature_version": VERSION,
+        "priors": [(0.0, 0.0)] * 4,
+        "terms": [{"alternative": 0, "feature": "range_m", "knots": (0.0, 1.0), "values": (0.0, 0.0)}],
+    }
+    with pytest.raises(ValidationError, match=r"for the VLP-16, not for the XT16: train one .* or set `model: null`"):
+        EvidenceDetect(unit={"model": "XT16"}, model=model)
+    for accepted in (None, model | {"lidar_model": "XT16"}):
+        assert EvidenceDetect(unit={"model": "XT16"}, model=accepted).settings.unit.model == "XT16"
+
+
 def test_a_rejected_lamp_is_not_published_again_while_the_drone_flies():
     """It is observed in each pass; another observation takes time from the drone."""
 

@@ -19,7 +19,7 @@ STEP_NS = 100_000_000
 
 
 @pytest.mark.parametrize("name", ["112351", "112379"])
-def test_a_turning_camera_states_a_consistent_rotation_and_no_translation(name):
+def test_the_rotation_of_a_turning_camera_is_not_overconfident_and_has_no_translation(name):
     rng = np.random.default_rng(int(name))
     odometry = FisheyeOdometry(
         lens=fisheye(), T_drone_camera=Pose(rpy_deg=(180.0, 0.0, -90.0)), link={"lens_share": 0.0}
@@ -40,4 +40,4 @@ def test_a_turning_camera_states_a_consistent_rotation_and_no_translation(name):
         assert motion.direction_from is None
         nees.append(error @ np.linalg.solve(motion.covariance_rad2, error))
     print(f"NEES of 3: {np.mean(nees):.1f}")  # noqa: T201
-    assert 0.2 < np.mean(nees) < 5.0
+    assert np.mean(nees) < 3.0

@@ -60,7 +60,7 @@ def test_a_packet_waits_for_a_newer_servo_state_and_packets_keep_their_order():
     out = list(stage.on_servo(servo(START_NS + 10 * MS, 0.1)))
     assert [type(m) for m in out] == [SweptPoints, SweptPulses] * 2  # of each packet the returns, then all its pulses
     assert [m.stamp_ns - START_NS for m in out] == [1 * MS, 1 * MS, 9 * MS, 9 * MS]
-    np.testing.assert_allclose([m.servo_rad[0] for m in out[::2]], [0.01, 0.09], atol=1e-6)
+    np.testing.assert_allclose([m.turntable_rad[0] for m in out[::2]], [0.01, 0.09], atol=1e-6)
     np.testing.assert_allclose([m.turntable_rad for m in out[1::2]], [0.01, 0.09], atol=1e-6)
     late = list(stage.on_firings(firings(UP, [START_NS + 9_500_000])))  # its angle is known already
     assert [m.stamp_ns for m in late] == [START_NS + 9_500_000] * 2

@@ -93,7 +93,7 @@ def test_a_point_is_turned_by_hand():
     placed = returns_of(table, firings([[0, 20, 0], [7, 0, 0], [0, 0, 9]]))
     expected = [[0, 0, 0.35 + 20], [0, 7, 0.35], [9, 0, 0.35]]  # lidar +z -> turntable -y -> vehicle +x
     np.testing.assert_allclose(placed.xyz_vehicle_m, expected, atol=1e-5)
-    np.testing.assert_allclose(placed.servo_rad, math.pi / 2)
+    np.testing.assert_allclose(placed.turntable_rad, math.pi / 2)
 
 
 def test_each_pulse_turns_with_the_angle_at_its_own_time():
@@ -103,7 +103,7 @@ def test_each_pulse_turns_with_the_angle_at_its_own_time():
     angle = np.array([0, math.pi / 4, math.pi / 2])
     expected = np.c_[10 * np.cos(angle), 10 * np.sin(angle), np.full(3, 0.35)]
     np.testing.assert_allclose(placed.xyz_vehicle_m, expected, atol=1e-5)
-    np.testing.assert_allclose(placed.servo_rad, angle, atol=1e-6)
+    np.testing.assert_allclose(placed.turntable_rad, angle, atol=1e-6)
 
 
 def test_the_whole_chain_equals_the_matrices():

@@ -13,7 +13,6 @@ from stages.detect.trained.existence import (
     SHELL_M,
     FalseReturns,
     birth_nats,
-    detection_probability,
     observed_nats,
     passed_nats,
     survived_nats,
@@ -55,6 +54,6 @@ def test_an_observation_counts_more_the_nearer_it_is_and_the_fewer_false_returns
 
 
 def test_pass_throughs_count_less_far_away_where_a_drone_does_not_always_return():
-    assert passed_nats(20.0, 3) == pytest.approx(math.log(1.0 - detection_probability(20.0, 3)))
+    assert passed_nats(20.0, 3) == pytest.approx(3.0 * math.log(0.4))  # three of 60 %
     assert passed_nats(20.0, 3) < passed_nats(50.0, 3) < passed_nats(50.0, 1) < 0.0
     assert math.isfinite(passed_nats(5.0, 500))

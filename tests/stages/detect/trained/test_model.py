@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from stages.detect.candidate import Alternative
 from stages.detect.trained.features import NAMES, VERSION
-from stages.detect.trained.model import ALTERNATIVES, FAR_M, NEAR_M, Answer, DetectorModel, reasons_of
+from stages.detect.trained.model import ALTERNATIVES, FAR_M, NEAR_M, DetectorModel, Prediction, reasons_of
 
 RANGE, SPEED = NAMES.index("range_m"), NAMES.index("speed_mps")
 FAR = {"alternative": 0, "feature": "range_m", "knots": (10.0, 20.0, 40.0), "values": (1.0, 0.0, -3.0)}
@@ -27,7 +27,7 @@ def features(**known):
 
 
 def log_odds(made, **known):
-    return made.answer(features(**known)).log_odds
+    return made.predict(features(**known)).log_odds
 
 
 def test_a_term_is_linear_between_its_knots_and_constant_beyond():
@@ -63,17 +63,17 @@ def test_the_prior_depends_on_whether_there_is_telemetry():
 
 def test_contributions_are_weighted_by_the_probability_of_their_alternative():
     two = model(FAR, FAST, priors=[(0.0, 0.0), (99.0, 99.0), (0.0, 0.0), (99.0, 99.0)])
-    answer = two.answer(features(range_m=40.0, speed_mps=10.0))
+    prediction = two.predict(features(range_m=40.0, speed_mps=10.0))
     share = math.exp(5.0) / (math.exp(3.0) + math.exp(5.0))
-    assert ALTERNATIVES[answer.alternative] is Alternative.BIRD
-    assert answer.contributions[[RANGE, SPEED]] == pytest.approx([-3.0 * (1 - share), -5.0 * share])
-    assert np.count_nonzero(answer.contributions) == 2
+    assert ALTERNATIVES[prediction.alternative] is Alternative.BIRD
+    assert prediction.contributions[[RANGE, SPEED]] == pytest.approx([-3.0 * (1 - share), -5.0 * share])
+    assert np.count_nonzero(prediction.contributions) == 2
 
 
 def test_the_reasons_are_the_largest_contributions_with_their_values():
     contributions = np.zeros(len(NAMES))
     contributions[[RANGE, SPEED]] = 0.5, -2.0
-    text = reasons_of(features(range_m=12.5), Answer(-1.0, 2, contributions))
+    text = reasons_of(features(range_m=12.5), Prediction(-1.0, 2, contributions))
     assert text == "speed over ground: not known (-2.0); range: 12.5 (+0.5); if not a drone: a bird"
 
 

@@ -29,7 +29,7 @@ from stages.geometry.trajectory import VehicleTrajectory
 from stages.messages import BranchState, CameraMount, RelativeRotation, VanishingDirections, VehicleMotion
 
 MIN_SEPARATION_RAD = math.radians(4.0)  # matches nearer to each other are the same
-LEAST_PROBABILITY = 0.01  # a less probable match is not published
+LEAST_PROBABILITY = 0.05  # a less probable match is not published: it counts as none
 VEHICLE_RAD_PER_S = math.radians(20.0)  # turn rate of a vehicle without VehicleMotion, one sigma
 VEHICLE_DRIFT_RAD2_PER_S = math.radians(0.1) ** 2  # of VehicleMotion
 

@@ -109,8 +109,9 @@ def test_lines_in_all_directions_have_no_probable_match():
         seen(CameraMount.VEHICLE, np.eye(3), angles, per_direction=2),
         seen(CameraMount.DRONE, np.eye(3), others, per_direction=2),
     )
-    assert output.probabilities[0] < 0.4
-    assert 1.0 - output.probabilities.sum() > 0.1  # that no match is right
+    assert len(output.rotations) > 5
+    assert output.probabilities[0] < 0.2
+    assert 1.0 - output.probabilities.sum() > 0.05  # that no match is right
 
 
 def test_streets_that_neither_camera_shares_with_the_other_give_no_rotation():

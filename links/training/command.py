@@ -43,7 +43,7 @@ def train_detector(
     and library versions give the same file, which names the command, the seeds and the scores. Brier score and log loss
     are over classifications of candidates, by range, with and without telemetry.
 
-    Example: OMP_NUM_THREADS=1 grd train-detector out/train/* -o configs/models/detector.yaml --held-out out/held_out
+    Example: grd train-detector out/train/* -o configs/models/detector.yaml --held-out out/held_out
     """
     import yaml
 

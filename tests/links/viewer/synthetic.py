@@ -102,7 +102,7 @@ def packet(t_s: float) -> tuple[LidarFirings, SweptPoints]:
         xyz_vehicle_m=(origin + rays * distance[:, None]).astype(np.float32)[seen],
         laser=laser[seen],
         reflectivity=reflectivity[seen],
-        servo_rad=np.full(int(seen.sum()), angle, np.float32),
+        turntable_rad=np.full(int(seen.sum()), angle, np.float32),
         pulses=len(laser),
     )
     return firings, swept

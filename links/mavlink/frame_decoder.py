@@ -19,16 +19,23 @@ from flow.link import Record
 from links.clock.device_clock import DeviceClock
 from links.mavlink.poses.independence import Independence
 from links.mavlink.poses.odom_frame import read_odom_frame
-from links.mavlink.readers import READERS, TIMELESS_READERS, AutopilotMessage
+from links.mavlink.readers import READERS, TIMELESS_READERS, AutopilotMessage, is_ranging_radio
 from links.mavlink.streams.imu_stamps import DELAY_NS, ImuSelection, time_since_boot_us
 from links.mavlink.transport.framing import SEQUENCE, header, known, parse_frame, timesync_target
-from stages.messages import AutopilotStatus, DroneAttitude, DroneLocalPosition, DroneOdometry, EarlierOdomFrame
+from stages.messages import (
+    AutopilotStatus,
+    DroneAttitude,
+    DroneGlobalPosition,
+    DroneLocalPosition,
+    DroneOdometry,
+    EarlierOdomFrame,
+)
 
 BOOT_TIME_TRUNCATION_NS = 500_000  # time_boot_ms is truncated, on average half a millisecond early
 ARMED = 128  # MAV_MODE_FLAG_SAFETY_ARMED
 CRITICAL = 5  # MAV_STATE_CRITICAL; above: emergency, poweroff, termination
 FOREIGN_TIMESYNC = "TIMESYNC for another component"  # reason in `rejected`
-ESTIMATES = (DroneAttitude, DroneLocalPosition, DroneOdometry)
+ESTIMATES = (DroneAttitude, DroneLocalPosition, DroneOdometry, DroneGlobalPosition)
 LATE = 128  # a sequence number this far ahead is a late frame, not 128 lost frames
 
 
@@ -75,7 +82,8 @@ class FrameDecoder:
             self.decoded += 1
             return timeless(frame, record.arrival_ns)
         reader = READERS.get(kind)
-        if reader is None or not self._imu.accepts(kind, record.arrival_ns):
+        used = is_ranging_radio(frame) if kind == "DISTANCE_SENSOR" else self._imu.accepts(kind, record.arrival_ns)
+        if reader is None or not used:
             self.unused += 1
             return None
         stamp_ns = self._stamp(frame, record.arrival_ns)

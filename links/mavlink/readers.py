@@ -31,16 +31,31 @@ from stages.messages import (
     AutopilotEstimator,
     AutopilotStatus,
     DroneAttitude,
+    DroneGlobalPosition,
+    DroneGnss,
     DroneImu,
     DroneLocalPosition,
     DroneOdometry,
+    UwbRange,
 )
 
-AutopilotMessage = DroneAttitude | DroneLocalPosition | DroneOdometry | DroneImu | AutopilotStatus | AutopilotEstimator
+AutopilotMessage = (
+    DroneAttitude
+    | DroneLocalPosition
+    | DroneOdometry
+    | DroneImu
+    | AutopilotStatus
+    | AutopilotEstimator
+    | DroneGnss
+    | DroneGlobalPosition
+    | UwbRange
+)
 
 STANDARD_GRAVITY_MPS2 = 9.80665
 LOCAL_FRAMES = (1, 20)  # MAV_FRAME_LOCAL_NED, MAV_FRAME_LOCAL_FRD
 BODY_FRD = 12
+FIX_3D = 3  # GPS_FIX_TYPE
+UNKNOWN_SENSOR, CUSTOM_ORIENTATION = 4, 100  # MAV_DISTANCE_SENSOR_UNKNOWN, MAV_SENSOR_ROTATION_CUSTOM
 
 # bits common to EKF_STATUS_FLAGS and ESTIMATOR_STATUS_FLAGS
 ATTITUDE, VELOCITY_HORIZONTAL, VELOCITY_VERTICAL, HORIZONTAL_RELATIVE = 1, 2, 4, 8
@@ -148,6 +163,47 @@ def _estimator(flags: int, stamp_ns: int, ratios: list[float]) -> AutopilotEstim
     )
 
 
+def read_gps_raw(frame: Any, stamp_ns: int) -> DroneGnss:
+    """GPS_RAW_INT with a 3D fix; other fixes raise ValueError. An accuracy of 0 is not reported."""
+    if frame.fix_type < FIX_3D:
+        raise ValueError("GNSS without a 3D fix")
+    return DroneGnss(
+        stamp_ns=stamp_ns,
+        **_geographic(frame),
+        sigma_m=1e-3 * frame.h_acc or None,
+        sigma_up_m=1e-3 * frame.v_acc or None,
+    )
+
+
+def read_global_position(frame: Any, stamp_ns: int) -> DroneGlobalPosition:
+    """GLOBAL_POSITION_INT."""
+    return DroneGlobalPosition(
+        stamp_ns=stamp_ns, **_geographic(frame), altitude_above_home_m=1e-3 * frame.relative_alt
+    )
+
+
+def read_distance_sensor(frame: Any, stamp_ns: int) -> UwbRange:
+    """DISTANCE_SENSOR of a ranging radio (`is_ranging_radio`)."""
+    if not frame.min_distance <= frame.current_distance <= frame.max_distance or frame.current_distance == 0:
+        raise ValueError("distance out of the sensor's range")
+    known = 0 < frame.covariance < 255  # [cm^2]; 255: unknown
+    sigma_m = 1e-2 * math.sqrt(frame.covariance) if known else None
+    return UwbRange(stamp_ns=stamp_ns, range_m=1e-2 * frame.current_distance, sigma_m=sigma_m)
+
+
+def is_ranging_radio(frame: Any) -> bool:
+    """Whether a DISTANCE_SENSOR is of a ranging radio, type UNKNOWN, orientation CUSTOM; others are rangefinders."""
+    return (frame.type, frame.orientation) == (UNKNOWN_SENSOR, CUSTOM_ORIENTATION)
+
+
+def _geographic(frame: Any) -> dict[str, float]:
+    """Latitude, longitude and altitude of a message with lat, lon [1e-7 deg] and alt [mm]."""
+    if abs(frame.lat) > 900_000_000 or abs(frame.lon) > 1_800_000_000 or (frame.lat == 0 and frame.lon == 0):
+        raise ValueError("no geographic position")
+    latitude_rad, longitude_rad = math.radians(1e-7 * frame.lat), math.radians(1e-7 * frame.lon)
+    return {"latitude_rad": latitude_rad, "longitude_rad": longitude_rad, "altitude_m": 1e-3 * frame.alt}
+
+
 Reader = Callable[[Any, int], AutopilotMessage]
 
 READERS: dict[str, Reader] = {
@@ -158,6 +214,9 @@ READERS: dict[str, Reader] = {
     "SCALED_IMU": read_raw_imu,
     "HIGHRES_IMU": read_highres_imu,
     "ESTIMATOR_STATUS": read_estimator_status,
+    "GPS_RAW_INT": read_gps_raw,
+    "GLOBAL_POSITION_INT": read_global_position,
+    "DISTANCE_SENSOR": read_distance_sensor,
 }
 """Readers of messages with a time stamp."""
 

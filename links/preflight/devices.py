@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from flow.link import Link
 from links.camera.checks import CameraChecks
 from links.clock import Clock
+from links.cues.checks import CuesChecks
 from links.dynamixel.checks import ServoChecks
 from links.lidar.checks import LidarChecks
 from links.mavlink.checks import AutopilotChecks
@@ -33,6 +34,7 @@ DEVICES: tuple[LinkChecks, ...] = (
     CameraChecks(),
     AutopilotChecks(),
     VehicleOdometryChecks(),
+    CuesChecks(),
     ClockChecks(),
     RecorderChecks(),
 )

@@ -28,9 +28,12 @@ MAX_AGE_S = 1.0
 
 @contextmanager
 def listen_udp(
-    topic: str, bind: str, port: int, sender: str | None, counters: Counter[str]
+    topic: str, bind: str, port: int, sender: str | None, counters: Counter[str], what: str = "the vehicle's odometry"
 ) -> Iterator[Iterator[Record]]:
-    """Open the socket and yield an iterator of records, which ends with the context. LinkError: it cannot be opened."""
+    """Open the socket and yield an iterator of records, which ends with the context. LinkError: it cannot be opened.
+
+    `what`: is received, for errors.
+    """
     closed = threading.Event()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
         try:
@@ -38,18 +41,18 @@ def listen_udp(
             udp.bind((bind, port))
         except OSError as error:
             raise LinkError(
-                f"cannot listen on UDP {bind}:{port} for the vehicle's odometry: {error.strerror}. Check `bind` and "
-                "`port`; is another grd listening there?"
+                f"cannot listen on UDP {bind}:{port} for {what}: {error.strerror}. Check `bind` and `port`; "
+                "is another grd listening there?"
             ) from error
         udp.settimeout(WAKE_S)
         try:
-            yield _records(udp, closed, topic, sender, counters)
+            yield _records(udp, closed, topic, sender, counters, what)
         finally:
             closed.set()
 
 
 def _records(
-    udp: socket.socket, closed: threading.Event, topic: str, sender: str | None, counters: Counter[str]
+    udp: socket.socket, closed: threading.Event, topic: str, sender: str | None, counters: Counter[str], what: str
 ) -> Iterator[Record]:
     while not closed.is_set():
         try:
@@ -59,7 +62,7 @@ def _records(
         except OSError as error:
             if closed.is_set():
                 return
-            raise LinkError(f"the vehicle's odometry: {error.strerror}: is the network interface still up?") from error
+            raise LinkError(f"{what}: {error.strerror}: is the network interface still up?") from error
         arrival_ns = datagram_time.arrival_ns(ancillary)
         if sender is not None and host != sender:
             counters["from other senders"] += 1

@@ -1,6 +1,6 @@
 """Aiming of beams: sweeps without gaps, observes candidates until they are classified, and keeps a beam on each track.
 
-    no track, no candidate     sweep the whole travel, back and forth
+    no track, no candidate     sweep the whole travel, back and forth; the sector of a cue, if there is one (search_sector.py)
     candidate                  point beams at it and around it until the detector has classified it, then continue
     TRACKING                   each rotor turn points one beam at the predicted position, with small alternating offsets
     COASTING                   the offsets grow with the uncertainty; above `coast_sigma_m` sweep
@@ -32,11 +32,12 @@ from stages.aim.beams import (
     sweep_step_rad,
 )
 from stages.aim.search_offset import MissedObservation, best_offset_m
+from stages.aim.search_sector import SearchSector
 from stages.aim.sweep_trajectory import SweepTrajectory
 from stages.aim.targets import Key, Target, Targets
 from stages.geometry.frames import LidarMount
 from stages.geometry.rig_lidar import RigLidar
-from stages.messages import Candidates, LidarFirings, ServoGoal, ServoState, TrackState
+from stages.messages import Candidates, CueState, LidarFirings, ServoGoal, ServoState, TrackState
 from stages.sweep.turntable import GearPlay
 
 RESULT_NS = 20_000_000  # from a pass to the output about it: PASS_OVER_NS of the tracker, a slice, a servo period
@@ -45,6 +46,7 @@ MIN_OBSERVATION_NS = 5_000_000
 INITIAL_PASS_S = 0.05  # first estimate of the time to the rotor's next pass
 INNER_RAD = math.radians(8.0)  # beams with a larger elevation are used only when others need much more movement
 SWEEP_DEVIATION_RAD = math.radians(12.0)  # of an observation during the sweep; the fan is 30 deg wide
+OUTSIDE_RAD = math.radians(2.0)  # from the sector: the servo first moves to it
 FRESH_NS = 350_000_000  # a candidate with a return this recent may be observed during the sweep
 MAX_MISSED = 24  # missed observations that are remembered; older ones are obsolete, the drone moves
 HALF_DETECTION = 0.3  # of the span: a beam so far from its middle has half the detection probability
@@ -56,6 +58,7 @@ class _State:
     sweep: SweepTrajectory
     play: GearPlay
     rotor: Rotor
+    sector: SearchSector
     servo_rad: float | None = None
     elevations_rad: tuple[float, ...] = ()
     slice_ns: int = 0  # length of the last slice
@@ -66,6 +69,7 @@ class _State:
     searching: bool = False  # for more drones, between observations of tracks
     search_until_ns: int = 0
     track_observations: int = 0  # since the last search segment
+    approach_rad: float | None = None  # end of the sector that the servo moves to
 
     @property
     def spacing_rad(self) -> float:
@@ -108,12 +112,13 @@ class BeamAimSettings(Settings):
 class BeamAim(Stage[BeamAimSettings]):
     """Keeps a beam on each tracked drone, and searches while there are fewer than `max_drones`."""
 
-    optional_inputs: ClassVar[frozenset[str]] = frozenset({"candidates"})
+    optional_inputs: ClassVar[frozenset[str]] = frozenset({"candidates", "cue"})
 
     def __init__(self, settings: BeamAimSettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
         rotor = Rotor(self.settings.unit.azimuth_offset_rad, self.settings.unit.azimuth_delay_ns)
-        self._state = _State(SweepTrajectory(*self._travel_rad), GearPlay(self.settings.mount), rotor)
+        mount, travel_rad = self.settings.mount, self._travel_rad
+        self._state = _State(SweepTrajectory(*travel_rad), GearPlay(mount), rotor, SearchSector(mount, travel_rad))
 
     @property
     def _travel_rad(self) -> tuple[float, float]:
@@ -134,6 +139,13 @@ class BeamAim(Stage[BeamAimSettings]):
     def on_state(self, state: TrackState) -> None:
         """Update a track's predicted position."""
         self._state.targets.update_track(state)
+
+    def on_cue(self, cue: CueState) -> None:
+        """Update the sector to search, by a cue that gives a position and is trusted."""
+        if cue.xyz_vehicle_m is not None and cue.covariance_m2 is not None:
+            self._state.sector.update(cue.stamp_ns, cue.xyz_vehicle_m, cue.covariance_m2)
+        elif not cue.trusted:
+            self._state.sector.withdraw()
 
     def on_servo(self, servo: ServoState) -> ServoGoal | None:
         """A new goal at the end of the planned observation, or at once when the target changes; else None."""
@@ -291,7 +303,19 @@ class BeamAim(Stage[BeamAimSettings]):
     # sweep
 
     def _sweep(self, servo: ServoState) -> ServoGoal | None:
-        resume_radps = self.settings.limit_rpm * RPM_RADPS if self._state.searching else None
+        state, limit_radps = self._state, self.settings.limit_rpm * RPM_RADPS
+        if not state.searching:
+            low_rad, high_rad = state.sector.limits(servo.stamp_ns, state.sweep.passes)
+            state.sweep.limit(low_rad, high_rad)
+            nearest_rad = min(max(servo.position_rad, low_rad), high_rad)
+            if abs(servo.position_rad - nearest_rad) > OUTSIDE_RAD:
+                if state.approach_rad == nearest_rad:
+                    return None
+                state.approach_rad = nearest_rad
+                state.sweep.stop()
+                return ServoGoal(stamp_ns=servo.stamp_ns, position_rad=nearest_rad, speed_radps=limit_radps)
+        state.approach_rad = None
+        resume_radps = limit_radps if state.searching else None
         goal = self._state.sweep.goal(servo.stamp_ns, servo.position_rad, self._search_radps(), resume_radps)
         if goal is None:
             return None

@@ -24,12 +24,19 @@ class SweepTrajectory:
     increasing: bool = True  # direction of the servo position
     nominal_rad: float | None = None  # position of the sweep during observations that do not interrupt it
     resume_rad: float | None = None  # where the last search segment between observations of tracks ended
+    passes: int = 0  # completed, from one end to the other
     _min_distance_rad: float = math.inf  # to the goal, since the goal was set
     _min_distance_ns: int = 0  # when that minimum last decreased
 
     def stop(self) -> None:
         """End the sweep. The next one starts from the servo position at that time."""
         self.goal_rad = None
+
+    def limit(self, low_rad: float, high_rad: float) -> None:
+        """Sweep between these positions from now on."""
+        if (low_rad, high_rad) != (self.low_rad, self.high_rad):
+            self.low_rad, self.high_rad = low_rad, high_rad
+            self.stop()
 
     def advance(self, position_rad: float, step_rad: float) -> float:
         """Nominal position [rad] of the sweep one step later, reflected at the ends of the travel."""
@@ -63,6 +70,7 @@ class SweepTrajectory:
             if not arrived:
                 return None
             self.increasing = not self.increasing
+            self.passes += 1
         if self.low_rad + END_TOLERANCE_RAD > position_rad:
             self.increasing = True
         elif self.high_rad - END_TOLERANCE_RAD < position_rad:

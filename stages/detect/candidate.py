@@ -99,7 +99,9 @@ class Candidate:
     large_object_passes: int = 0
     large_object_m: float = math.inf
     seen_ns: int = 0
-    log_odds: float = 0.0  # newest result of the classifier
+    log_odds: float = 0.0  # newest result of the classifier, cues included
+    cue_nats: float | None = None  # what cues add to it; None: no cue yet
+    cue_ns: int = 0  # when that was computed
     reason: str = ""  # for people
     alternative: Alternative | None = None  # the most probable one; None: not classified yet
     rejection: str = ""  # the alternative and the kinds of reasons for it, for people

@@ -25,6 +25,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from flow.stage import Settings, Stage
+from stages.cues.evidence import CueEvidence, CueWeights, ObjectState
 from stages.detect.candidate import SAME_PASS_NS, START_SPEED_MPS, STATIC_M, Alternative, Candidate, Observation
 from stages.detect.candidate_messages import candidate_log, candidates_message, detections_message, log_odds_of
 from stages.detect.candidate_table import CandidateTable, positions_of
@@ -45,7 +46,9 @@ from stages.kernels.sweep.pulses import cone_of
 from stages.messages import (
     CandidateLog,
     Candidates,
+    CueState,
     Detections,
+    DroneCue,
     DroneLocalPosition,
     DroneOdometry,
     SweptPulses,
@@ -60,6 +63,8 @@ REVISITED_M = 0.5  # the same position
 MAX_STATIC = 64  # static objects remembered
 HYSTERESIS_NATS = 1.65  # an accepted candidate is rejected this far below the threshold
 AT_REST_MPS = np.zeros(3)
+COMPARED_NS = 500_000_000  # a cue is compared with an accepted candidate observed this recently,
+COMPARED_PASSES = 5  # in so many scan passes
 STATIC_NS = 60_000_000_000  # how long a static object is remembered
 
 
@@ -78,6 +83,7 @@ class _State:
 
     finder: ObservationFinder
     travel: Travel
+    cues: CueEvidence
     trail: VehicleTrajectory = field(default_factory=VehicleTrajectory)
     telemetry: DetectorTelemetry = field(default_factory=DetectorTelemetry)
     table: CandidateTable = field(default_factory=CandidateTable)
@@ -115,6 +121,7 @@ class EvidenceDetectSettings(Settings):
     parked: bool = False  # the vehicle does not move: motion is known without VehicleMotion
     free_space: bool = True  # ablation: False ignores the measured surroundings
     weights: ClassifierWeights = ClassifierWeights()  # log likelihood ratios of the classifier
+    cues: CueWeights = CueWeights()  # what GNSS, ranging and barometer may add
     model: DetectorModel | None = None  # trained by `grd train-detector`; null: the classifier by `weights`
 
     @model_validator(mode="after")
@@ -132,7 +139,7 @@ class EvidenceDetectSettings(Settings):
 class EvidenceDetect(Stage[EvidenceDetectSettings]):
     """Accepts small objects that are repeatedly observed with free space around them; rejects others with a reason."""
 
-    optional_inputs: ClassVar[frozenset[str]] = frozenset({"motion", "drone_position", "drone_odometry"})
+    optional_inputs: ClassVar[frozenset[str]] = frozenset({"motion", "drone_position", "drone_odometry", "cue"})
 
     def __init__(self, settings: EvidenceDetectSettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
@@ -145,7 +152,8 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
             settings.clear_m,
         )
         finder = ObservationFinder(limits, settings.unit.profile)
-        self._now = _State(finder, Travel(math.radians(settings.sweep_deg - 3.0), math.radians(0.5)))
+        travel = Travel(math.radians(settings.sweep_deg - 3.0), math.radians(0.5))
+        self._now = _State(finder, travel, CueEvidence(settings.cues, settings.furthest_m))
 
     def on_motion(self, motion: VehicleMotion) -> None:
         """Update the vehicle's trajectory. Without it only vertical motion counts, unless `parked` is set."""
@@ -158,6 +166,19 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
     def on_drone_odometry(self, odometry: DroneOdometry) -> None:
         """Add the drone's odometry, from an autopilot that sends it."""
         self._now.telemetry.add_odometry(odometry)
+
+    def on_cue(self, cue: DroneCue) -> CueState:
+        """Add a measurement of another sensor, and compare it with the drones that were accepted without cues."""
+        now, accept = self._now, log_odds_of(self.settings.accept_probability)
+        drones = [
+            _object(c)
+            for c in now.table
+            if c.accepted
+            and c.scan_passes >= COMPARED_PASSES
+            and abs(cue.stamp_ns - c.seen_ns) < COMPARED_NS
+            and c.log_odds - (c.cue_nats or 0.0) >= accept
+        ]
+        return now.cues.add(cue, now.trail, drones)
 
     def on_pulses(self, pulses: SweptPulses) -> Iterator[CandidateLog | Candidates | Detections]:
         """Process one slice: classify the observations that it completes and publish changes."""
@@ -265,12 +286,25 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
         c.features = features_of(c, settings.span_m, motion_known)
         if settings.model is not None:
             c.log_odds, c.reason = settings.model.classify(c)
+        self._add_cues(now, c)
         now.classified[c.number] = c
         accept = log_odds_of(settings.accept_probability)
         c.accepted = c.log_odds >= accept or (c.accepted and c.log_odds >= accept - HYSTERESIS_NATS)
         before, c.is_promising = c.is_promising, c.log_odds >= log_odds_of(settings.follow_up_probability)
         c.was_promising |= c.is_promising
         return c.was_promising or before != c.is_promising
+
+    def _add_cues(self, now: _State, c: Candidate) -> None:
+        """Add the evidence of cues to the log-odds: their lowest of the last seconds, so that a short match is none."""
+        nats, remark = now.cues.nats(_object(c), now.trail, c.stamp_ns)
+        if not remark and c.cue_nats is None:
+            return
+        if c.cue_nats is not None:
+            since_s = (c.stamp_ns - c.cue_ns) * 1e-9
+            nats = min(nats, c.cue_nats + self.settings.cues.recovery_nats_per_s * since_s)
+        c.cue_nats, c.cue_ns = nats, c.stamp_ns
+        c.log_odds += nats
+        c.reason += f"; cues {nats:+.1f}" + (f" ({remark})" if remark else "")
 
     def _count_pass_throughs(self, now: _State, part: Slice, now_ns: int) -> None:
         """Count the pulses that pass through a candidate's predicted position, scan pass by scan pass."""
@@ -369,3 +403,8 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
         now.start_ns, now.end_ns = end_ns + 1, None
         now.rejected.clear()
         now.finder.hidden.clear()
+
+
+def _object(c: Candidate) -> ObjectState:
+    """Position and velocity of a candidate."""
+    return ObjectState(c.stamp_ns, c.xyz_m, c.velocity_mps, c.p)

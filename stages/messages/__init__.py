@@ -1,6 +1,6 @@
 """All messages between stages, by module in the order of data flow. Frames: see `stages/geometry/frames.py`.
 
-    sensors -> sweep -> drone;  sensors -> cameras;  autopilot;  all of them -> pose
+    sensors -> sweep -> drone;  sensors -> cameras;  cues;  autopilot;  all of them -> pose
 
 `stamp_ns` is the time at which a message's content was true, not its arrival. None of them contains ground truth.
 
@@ -22,6 +22,13 @@ from stages.messages.cameras import FollowedFeatures as FollowedFeatures
 from stages.messages.cameras import RelativeRotation as RelativeRotation
 from stages.messages.cameras import VanishingDirections as VanishingDirections
 from stages.messages.cameras import VisualMotion as VisualMotion
+from stages.messages.cues import CueKind as CueKind
+from stages.messages.cues import CueState as CueState
+from stages.messages.cues import DroneCue as DroneCue
+from stages.messages.cues import DroneGlobalPosition as DroneGlobalPosition
+from stages.messages.cues import DroneGnss as DroneGnss
+from stages.messages.cues import UwbRange as UwbRange
+from stages.messages.cues import VehicleGnss as VehicleGnss
 from stages.messages.drone import AutopilotMotion as AutopilotMotion
 from stages.messages.drone import CandidateEvidence as CandidateEvidence
 from stages.messages.drone import CandidateLog as CandidateLog

@@ -44,10 +44,12 @@ RATE_WINDOW_NS = 2_000_000_000  # in which a rate is measured
 NEEDED_IMU_HZ = 10.0  # heading and preintegration work from this rate on
 LOW_SHARE = 0.7  # of the accepted rate: below, it is requested again
 NAMES: dict[str, int] = {
+    "GPS_RAW_INT": 24,
     "SCALED_IMU": 26,
     "RAW_IMU": 27,
     "ATTITUDE": 30,
     "LOCAL_POSITION_NED": 32,
+    "GLOBAL_POSITION_INT": 33,
     "HIGHRES_IMU": 105,
     "EKF_STATUS_REPORT": 193,
     "ESTIMATOR_STATUS": 230,
@@ -68,6 +70,7 @@ class MessageRates(BaseModel):
     attitude_hz: float = Field(default=25.0, ge=0, le=400)
     position_hz: float = Field(default=25.0, ge=0, le=400)
     estimator_hz: float = Field(default=5.0, ge=0, le=50)
+    gnss_hz: float = Field(default=0.0, ge=0, le=50)  # GPS_RAW_INT and GLOBAL_POSITION_INT, for cues
 
 
 @dataclass(slots=True)
@@ -115,6 +118,8 @@ class MessageIntervals:
             (("ATTITUDE",), rates.attitude_hz),
             (("LOCAL_POSITION_NED",), rates.position_hz),
             ((ESTIMATOR_MESSAGES[profile],), rates.estimator_hz),
+            (("GPS_RAW_INT",), rates.gnss_hz),
+            (("GLOBAL_POSITION_INT",), rates.gnss_hz),
         )
         self._counts: Counter[str] = Counter()
         self._rates: dict[str, _Rate] = {}

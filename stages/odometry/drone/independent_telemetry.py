@@ -1,6 +1,7 @@
 """Telemetry of the autopilot that is independent of poses of grd; the only stage that reads its estimate.
 
-    DroneLocalPosition, DroneOdometry, DroneAttitude   passed on while `independent`, else dropped
+    DroneLocalPosition, DroneOdometry, DroneAttitude,
+    DroneGlobalPosition                                passed on while `independent`, else dropped
     DroneTilt                                          always: roll and pitch of DroneAttitude, never its yaw
     HeadingPrior                                       for PRIOR_S after the newest pose of an earlier run of grd
 
@@ -29,6 +30,7 @@ from flow.stage import Settings, Stage
 from stages.geometry.frames import heading_rad, rotation_z
 from stages.messages import (
     DroneAttitude,
+    DroneGlobalPosition,
     DroneImu,
     DroneLocalPosition,
     DroneOdometry,
@@ -54,7 +56,9 @@ class IndependentTelemetrySettings(Settings):
 class IndependentTelemetry(Stage[IndependentTelemetrySettings]):
     """Passes the autopilot's estimate on while it is independent, and its roll and pitch always."""
 
-    optional_inputs: ClassVar[frozenset[str]] = frozenset({"attitude", "position", "odometry", "imu", "earlier"})
+    optional_inputs: ClassVar[frozenset[str]] = frozenset(
+        {"attitude", "position", "odometry", "imu", "earlier", "global_position"}
+    )
 
     def __init__(self, settings: IndependentTelemetrySettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
@@ -126,3 +130,8 @@ class IndependentTelemetry(Stage[IndependentTelemetrySettings]):
         """Pose and velocities."""
         self._dropped += not odometry.independent
         return odometry if odometry.independent else None
+
+    def on_global_position(self, position: DroneGlobalPosition) -> DroneGlobalPosition | None:
+        """Geographic position."""
+        self._dropped += not position.independent
+        return position if position.independent else None

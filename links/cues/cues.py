@@ -1,0 +1,71 @@
+"""Cues by UDP as a source: one JSON object, or NMEA sentences, per datagram (`parsing.py`).
+
+Cues are optional, as is each of them. A recording without them is no error.
+
+Source: recording format in recordings/README.md (/cues).
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import AbstractContextManager
+from ipaddress import IPv4Address
+from typing import Any
+
+from pydantic import Field, model_validator
+
+from flow.counters import Counters
+from flow.link import LinkError, Record, Source, SourceSettings
+from links.cues.parsing import CueParser
+from links.vehicle_odometry.udp import listen_udp
+from stages.messages import DroneGnss, UwbRange, VehicleGnss
+
+
+class CuesSettings(SourceSettings):
+    """Settings of `Cues`."""
+
+    topic: str = "/cues"
+    port: int | None = Field(None, ge=1, le=65535)  # UDP, live; None: no live cues
+    bind: IPv4Address = IPv4Address("127.0.0.1")  # this host's address
+    sender: IPv4Address | None = None  # the sender's address; others are ignored
+
+    @model_validator(mode="after")
+    def _sender_is_known(self) -> CuesSettings:
+        if self.sender is None and not self.bind.is_loopback:
+            raise ValueError(f"sender: set the cues' sender when binding to {self.bind}, so that others are ignored")
+        return self
+
+
+class Cues(Source[CuesSettings]):
+    """GNSS of the vehicle and of the drone, ranges. A datagram without a valid cue is counted and skipped."""
+
+    def __init__(self, settings: CuesSettings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._parser = CueParser()
+        self._udp: Counter[str] = Counter()
+        self._rejected: Counter[str] = Counter()
+        self._decoded: int = 0
+
+    @property
+    def counters(self) -> Counters:
+        """Totals since the start: cues, from other senders; rejected by reason."""
+        return Counters({"cues": self._decoded} | dict(self._udp), self._rejected)
+
+    def listen(self) -> AbstractContextManager[Iterator[Record]]:
+        """Receive cues: `with cues.listen() as records`. LinkError without `port`, or when it cannot be opened."""
+        settings = self.settings
+        if settings.port is None:
+            raise LinkError(f"{settings.topic}: set `port` to receive cues, or remove the link")
+        sender = None if settings.sender is None else str(settings.sender)
+        return listen_udp(settings.topic, str(settings.bind), settings.port, sender, self._udp, "cues")
+
+    def decode(self, record: Record) -> Iterator[VehicleGnss | DroneGnss | UwbRange]:
+        """The cues of one datagram; none of an invalid one."""
+        try:
+            found = self._parser.parse(record.stamp_ns, record.data)
+        except ValueError as error:
+            self._rejected[str(error)] += 1
+            return
+        self._decoded += len(found)
+        yield from found

@@ -1,0 +1,171 @@
+"""Cues from bytes: one JSON object, or NMEA sentences, per datagram. Everything is checked; nothing is repaired.
+
+    {"vehicle_gnss": {"latitude_deg", "longitude_deg", "altitude_m"}}   optional: "sigma_m", "sigma_up_m",
+                                                      "heading_deg" (clockwise from true north), "heading_sigma_deg"
+    {"drone_gnss": {"latitude_deg", "longitude_deg", "altitude_m"}}     optional: "sigma_m", "sigma_up_m"
+    {"uwb_range": {"range_m"}}                                          optional: "sigma_m"
+    $GNGGA,... and $GNHDT,...                          position and heading of the vehicle
+
+Beside them `age_s`, as for the vehicle's odometry. NMEA's altitude is that above mean sea level, as MAVLink's is.
+
+Source: recordings/README.md (/cues); NMEA 0183 as in https://gpsd.gitlab.io/gpsd/NMEA.html (GGA, HDT, checksum).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any, cast
+
+from stages.messages import DroneGnss, UwbRange, VehicleGnss
+
+MAX_BYTES = 2_000
+MAX_RANGE_M = 1_000.0
+MAX_SIGMA_M = 1_000.0
+ALTITUDES_M = (-1_000.0, 20_000.0)
+HEADING_NS = 1_000_000_000  # largest age of an HDT sentence against a GGA
+
+Cue = VehicleGnss | DroneGnss | UwbRange
+
+
+class CueParser:
+    """Parses datagrams in order: the heading of an HDT sentence belongs to the next position."""
+
+    def __init__(self) -> None:
+        self._heading: tuple[int, float] | None = None  # stamp, yaw from east
+
+    def parse(self, stamp_ns: int, data: bytes) -> list[Cue]:
+        """The cues of a datagram. ValueError: it holds no cue, or an invalid one."""
+        if len(data) > MAX_BYTES:
+            raise ValueError("longer than a cue")
+        if data[:1] == b"$":
+            return self._nmea(stamp_ns, data)
+        try:
+            values: Any = json.loads(data)
+        except (ValueError, RecursionError):
+            raise ValueError("neither JSON nor NMEA") from None
+        if not isinstance(values, dict):
+            raise ValueError("no JSON object")
+        fields = cast("dict[str, Any]", values)
+        found = [read(stamp_ns, fields[name]) for name, read in _READERS.items() if name in fields]
+        if not found:
+            raise ValueError("an unknown cue")
+        return found
+
+    def _nmea(self, stamp_ns: int, data: bytes) -> list[Cue]:
+        found: list[Cue] = []
+        for line in data.splitlines():
+            fields = nmea_fields(line)
+            if fields[0][2:] == "HDT":
+                self._heading = stamp_ns, _yaw_enu(_text_number(fields, 1))
+            elif fields[0][2:] == "GGA" and (position := self._gga(stamp_ns, fields)) is not None:
+                found.append(position)
+        return found
+
+    def _gga(self, stamp_ns: int, fields: list[str]) -> VehicleGnss | None:
+        """Position of a GGA sentence; None without a fix."""
+        if len(fields) < 11:
+            raise ValueError("GGA is cut off")
+        if fields[6] in ("", "0"):
+            return None
+        heading = self._heading
+        known = heading is not None and abs(stamp_ns - heading[0]) <= HEADING_NS
+        return VehicleGnss(
+            stamp_ns=stamp_ns,
+            latitude_rad=_angle(fields, 2, "NS", 90),
+            longitude_rad=_angle(fields, 4, "EW", 180),
+            altitude_m=_within(_text_number(fields, 9), *ALTITUDES_M),
+            sigma_m=None,
+            sigma_up_m=None,
+            yaw_enu_rad=heading[1] if heading is not None and known else None,
+            yaw_sigma_rad=None,
+        )
+
+
+def nmea_fields(line: bytes) -> list[str]:
+    """Fields of a sentence. ValueError: no sentence, or a wrong checksum."""
+    body, star, checksum = line.strip().removeprefix(b"$").partition(b"*")
+    total = 0
+    for byte in body:
+        total ^= byte
+    try:
+        if not line.startswith(b"$") or not star or int(checksum, 16) != total:
+            raise ValueError
+        return body.decode("ascii").split(",")
+    except ValueError:
+        raise ValueError("NMEA with a wrong checksum") from None
+
+
+def _angle(fields: list[str], at: int, signs: str, limit: int) -> float:
+    """An angle ddmm.mmmm with its hemisphere [rad]."""
+    value = _text_number(fields, at)
+    degrees = math.floor(value / 100)
+    if fields[at + 1] not in tuple(signs):
+        raise ValueError("NMEA without a hemisphere")
+    sign = 1 if fields[at + 1] == signs[0] else -1
+    return math.radians(sign * _within(degrees + (value - 100 * degrees) / 60, 0, limit))
+
+
+def _text_number(fields: list[str], at: int) -> float:
+    if at >= len(fields):
+        raise ValueError("NMEA is cut off")
+    try:
+        value = float(fields[at])
+    except ValueError:
+        raise ValueError("NMEA without a number") from None
+    return _within(value, -1e6, 1e6)
+
+
+def _within(value: float, low: float, high: float) -> float:
+    if not low <= value <= high:  # NaN compares false
+        raise ValueError("a value out of its range")
+    return value
+
+
+def _yaw_enu(heading_deg: float) -> float:
+    """Counter-clockwise from east, of a heading clockwise from north."""
+    return math.remainder(math.radians(90.0 - heading_deg), math.tau)
+
+
+def _number(values: Any, name: str, low: float, high: float) -> float:
+    value = values.get(name) if isinstance(values, dict) else None
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ValueError(f"no number '{name}'")
+    return _within(float(value), low, high)
+
+
+def _optional(values: Any, name: str, low: float, high: float) -> float | None:
+    return _number(values, name, low, high) if isinstance(values, dict) and values.get(name) is not None else None
+
+
+def _position(values: Any) -> dict[str, Any]:
+    return {
+        "latitude_rad": math.radians(_number(values, "latitude_deg", -90, 90)),
+        "longitude_rad": math.radians(_number(values, "longitude_deg", -180, 180)),
+        "altitude_m": _number(values, "altitude_m", *ALTITUDES_M),
+        "sigma_m": _optional(values, "sigma_m", 0, MAX_SIGMA_M),
+        "sigma_up_m": _optional(values, "sigma_up_m", 0, MAX_SIGMA_M),
+    }
+
+
+def _vehicle_gnss(stamp_ns: int, values: Any) -> Cue:
+    heading_deg = _optional(values, "heading_deg", -360, 360)
+    sigma_deg = _optional(values, "heading_sigma_deg", 0, 180)
+    return VehicleGnss(
+        stamp_ns=stamp_ns,
+        **_position(values),
+        yaw_enu_rad=None if heading_deg is None else _yaw_enu(heading_deg),
+        yaw_sigma_rad=None if heading_deg is None or sigma_deg is None else math.radians(sigma_deg),
+    )
+
+
+def _drone_gnss(stamp_ns: int, values: Any) -> Cue:
+    return DroneGnss(stamp_ns=stamp_ns, **_position(values))
+
+
+def _uwb_range(stamp_ns: int, values: Any) -> Cue:
+    sigma_m = _optional(values, "sigma_m", 0, MAX_SIGMA_M)
+    return UwbRange(stamp_ns=stamp_ns, range_m=_number(values, "range_m", 0, MAX_RANGE_M), sigma_m=sigma_m)
+
+
+_READERS = {"vehicle_gnss": _vehicle_gnss, "drone_gnss": _drone_gnss, "uwb_range": _uwb_range}

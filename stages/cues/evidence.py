@@ -1,0 +1,165 @@
+"""Cues as evidence about a candidate of the detector, with a cap, and the state of each cue.
+
+    nats = ln[ (1 - e) N(z; h(x) + b, S) / p_0 + e ],   at most the cue's cap;  at least ln e
+
+z: measurement, h(x): the same of the candidate's position x at the time of the measurement, b and S: bias and covariance
+of the cue and of the candidate, p_0: density of z for an object anywhere within the search range, e: probability that a
+cue is of another object. Of the newest three measurements of a cue the median counts: a single reflection changes
+nothing. The caps are the safety: with the largest sum a candidate must reach even odds by the LiDAR alone. A cue that
+contradicts the candidate removes what the others add.
+
+A cue that contradicts the drone found by the LiDAR alone is not used and is reported (`bias.py`).
+
+Source: ours; the mixture after Box, Tiao, "A Bayesian approach to some outlier problems", Biometrika 55 (1968).
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass, field
+from statistics import median_low
+from typing import NamedTuple
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from stages.cues.bias import CueBias
+from stages.geometry.frames import Array64
+from stages.geometry.trajectory import VehicleTrajectory
+from stages.messages import CueKind, CueState, DroneCue
+
+NEWEST = 3  # measurements of a cue that count
+OLDEST_NS = 1_500_000_000
+CONTRADICTS_NATS = -1.0  # below: the cue contradicts the candidate
+
+
+class CueWeights(BaseModel):
+    """What cues may add to the log-odds of a candidate [nats]."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    outlier_probability: float = Field(0.1, gt=0, lt=0.5)  # that a cue is of another object
+    max_gnss: float = Field(3.0, ge=0, le=6)
+    max_uwb: float = Field(2.0, ge=0, le=6)
+    max_altitude: float = Field(1.0, ge=0, le=6)  # objects are not uniform over height
+    max_sum: float = Field(3.0, ge=0, le=6)
+    recovery_nats_per_s: float = Field(1.0, gt=0)  # how fast a candidate recovers from a contradiction
+
+    def cap(self, source: str) -> float:
+        """Cap of one cue."""
+        return {"gnss": self.max_gnss, "uwb": self.max_uwb, "altitude": self.max_altitude}.get(source, 0.0)
+
+
+class ObjectState(NamedTuple):
+    """Position and velocity of an object in frame map, with equal variances on the three axes."""
+
+    stamp_ns: int
+    xyz_m: Array64
+    velocity_mps: Array64
+    p: tuple[float, float, float]  # variances: position, position-velocity, velocity
+
+
+@dataclass(slots=True, eq=False)
+class _Cue:
+    bias: CueBias
+    newest: deque[DroneCue] = field(default_factory=lambda: deque[DroneCue](maxlen=NEWEST))
+
+
+class CueEvidence:
+    """The newest measurements of all cues, and their biases."""
+
+    def __init__(self, weights: CueWeights, search_m: float) -> None:
+        """`search_m`: greatest range of candidates."""
+        self._weights, self._search_m = weights, search_m
+        self._cues: dict[str, _Cue] = {}
+
+    def add(self, cue: DroneCue, trail: VehicleTrajectory, drones: list[ObjectState]) -> CueState:
+        """Add a measurement; `drones` were accepted without cues, at most half a second ago."""
+        known = self._cues.get(cue.source)
+        if known is None or len(known.bias.mean_m) != len(cue.value_m):  # the first, or of another kind
+            trusted = known is None or known.bias.trusted
+            known = self._cues[cue.source] = _Cue(CueBias(cue.bias_covariance_m2, trusted))
+        known.newest.append(cue)
+        bias = known.bias
+        bias.predict(cue.stamp_ns, cue.bias_covariance_m2)
+        offset_m = math.nan
+        if drones:
+            compared = [residual_of(cue, trail, drone) for drone in drones]
+            residual_m, noise_m2 = min(compared, key=lambda pair: bias.distance2(*pair))
+            offset_m = float(np.linalg.norm(residual_m))
+            bias.compare(residual_m, noise_m2)
+        return _state_of(cue, bias, offset_m, trail)
+
+    def nats(self, c: ObjectState, trail: VehicleTrajectory, now_ns: int) -> tuple[float, str]:
+        """What all cues add to the log-odds that an object is the drone, and the remark for people."""
+        by_source: dict[str, float] = {}
+        for source, cue in self._cues.items():
+            recent = [z for z in cue.newest if now_ns - z.stamp_ns < OLDEST_NS]
+            if recent and cue.bias.trusted:
+                by_source[source] = median_low([self._nats(z, cue.bias, trail, c) for z in recent])
+        if not by_source:
+            return 0.0, ""
+        total = min(sum(by_source.values()), self._weights.max_sum)
+        if min(by_source.values()) < CONTRADICTS_NATS:
+            total = min(total, min(by_source.values()))
+        return total, ", ".join(f"{source} {nats:+.1f}" for source, nats in by_source.items())
+
+    def _nats(self, cue: DroneCue, bias: CueBias, trail: VehicleTrajectory, c: ObjectState) -> float:
+        residual_m, noise_m2 = residual_of(cue, trail, c)
+        n, S = len(residual_m), bias.covariance_m2 + noise_m2
+        log_density = -0.5 * (bias.distance2(residual_m, noise_m2) + math.log(np.linalg.det(math.tau * S)))
+        log_uniform = -math.log(2.0 / 3.0 * math.pi) if cue.kind is CueKind.POSITION else 0.0
+        e = self._weights.outlier_probability
+        ratio = math.exp(min(log_density - log_uniform + n * math.log(self._search_m), 50.0))
+        return min(math.log((1.0 - e) * ratio + e), self._weights.cap(cue.source))
+
+
+def residual_of(cue: DroneCue, trail: VehicleTrajectory, c: ObjectState) -> tuple[Array64, Array64]:
+    """Measurement minus that of an object at its time (n,), and the covariance (n, n) of both without the bias."""
+    dt = (cue.stamp_ns - c.stamp_ns) * 1e-9
+    offset_m = c.xyz_m + dt * c.velocity_mps - trail.at(cue.stamp_ns)[1]
+    value_m, H = measure(cue.kind, offset_m, cue.reference_map_m)
+    variance = max(c.p[0] + 2.0 * dt * c.p[1] + dt * dt * c.p[2], 0.0)
+    return cue.value_m - value_m, cue.covariance_m2 + variance * (H @ H.T)
+
+
+def measure(kind: CueKind, offset_m: Array64, reference_m: Array64) -> tuple[Array64, Array64]:
+    """Measurement (n,) of a position (3,) relative to the vehicle, and its Jacobian (n, 3)."""
+    if kind is CueKind.POSITION:
+        return offset_m, np.eye(3)
+    if kind is CueKind.HEIGHT:
+        return offset_m[2:], np.array([[0.0, 0.0, 1.0]])
+    if kind is CueKind.RANGE:
+        from_m = offset_m - reference_m
+        range_m = max(float(np.linalg.norm(from_m)), 1e-6)
+        return np.array([range_m]), (from_m / range_m)[None]
+    level_m = max(math.hypot(offset_m[0], offset_m[1]), 1e-6)
+    H = np.array([[offset_m[0] / level_m, offset_m[1] / level_m, 0.0], [0.0, 0.0, 1.0]])
+    return np.array([level_m, offset_m[2]]), H
+
+
+def _state_of(cue: DroneCue, bias: CueBias, offset_m: float, trail: VehicleTrajectory) -> CueState:
+    """The state of a cue after a measurement; a position only of a trusted one."""
+    sigma_m = math.sqrt(float(np.linalg.eigvalsh(bias.covariance_m2)[-1]))
+    apart = "" if math.isnan(offset_m) else f", {offset_m:.1f} m from the drone that the LiDAR sees"
+    if bias.trusted:
+        reason = f"bias known to {sigma_m:.1f} m{apart}"
+    else:
+        reason = f"contradicts the LiDAR{apart}: it is not used (of another drone, or the sensor has failed)"
+    xyz_vehicle_m = covariance_m2 = None
+    if cue.kind is CueKind.POSITION and bias.trusted:
+        R = trail.at(cue.stamp_ns)[0]
+        xyz_vehicle_m = R.T @ (cue.value_m - bias.mean_m)
+        covariance_m2 = R.T @ (bias.covariance_m2 + cue.covariance_m2) @ R
+    return CueState(
+        stamp_ns=cue.stamp_ns,
+        source=cue.source,
+        trusted=bias.trusted,
+        reason=reason,
+        bias_m=bias.mean_m,
+        bias_sigma_m=sigma_m,
+        offset_m=offset_m,
+        xyz_vehicle_m=xyz_vehicle_m,
+        covariance_m2=covariance_m2,
+    )

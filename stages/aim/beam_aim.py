@@ -1,6 +1,6 @@
 """Aiming of beams: sweeps without gaps, observes candidates until they are classified, and keeps a beam on each track.
 
-    no track, no candidate     sweep the whole travel, back and forth; the sector of a cue, if there is one (search_sector.py)
+    no track, no candidate     sweep the whole travel, back and forth; of a cue first its sector (search_sector.py)
     candidate                  point beams at it and around it until the detector has classified it, then continue
     TRACKING                   each rotor turn points one beam at the predicted position, with small alternating offsets
     COASTING                   the offsets grow with the uncertainty; above `coast_sigma_m` sweep

@@ -2,8 +2,8 @@
 
     nats = ln[ (1 - e) N(z; h(x) + b, S) / p_0 + e ],   at most the cue's cap;  at least ln e
 
-z: measurement, h(x): the same of the candidate's position x at the time of the measurement, b and S: bias and covariance
-of the cue and of the candidate, p_0: density of z for an object anywhere within the search range, e: probability that a
+z: measurement, h(x): the same of the candidate's position x at that time, b and S: bias and covariance of the cue and
+of the candidate, p_0: density of z for an object anywhere within the search range, e: probability that a
 cue is of another object. Of the newest three measurements of a cue the median counts: a single reflection changes
 nothing. The caps are the safety: with the largest sum a candidate must reach even odds by the LiDAR alone. A cue that
 contradicts the candidate removes what the others add.
@@ -75,7 +75,7 @@ class CueEvidence:
         self._cues: dict[str, _Cue] = {}
 
     def add(self, cue: DroneCue, trail: VehicleTrajectory, drones: list[ObjectState]) -> CueState:
-        """Add a measurement; `drones` were accepted without cues, at most half a second ago."""
+        """Add a measurement; `drones` are those that the LiDAR alone would accept, seen at most 0.5 s ago."""
         known = self._cues.get(cue.source)
         if known is None or len(known.bias.mean_m) != len(cue.value_m):  # the first, or of another kind
             trusted = known is None or known.bias.trusted

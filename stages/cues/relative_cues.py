@@ -6,11 +6,11 @@
     altitude   the autopilot's altitude above home (barometer), from the height of the take-off point
 
 Each has a latency (the measurement was true so long before its stamp), noise, and a bias that changes slowly. The bias
-of GNSS is that of one receiver; those of drone and vehicle add up. The autopilot's estimate is used only while it cannot
-contain a pose that grd sent (`IndependentTelemetry`); a receiver's own position never contains one.
+of GNSS is that of one receiver; those of drone and vehicle add up. The autopilot's estimate is used only while it
+cannot contain a pose that grd sent (`IndependentTelemetry`); a receiver's own position never contains one.
 
-Source: ours. GNSS of a logged Pixhawk flight: 2.9 m off horizontally (median), nearly constant over 188 s; 2.5 m an axis
-(a Rayleigh distribution's median is 1.18 sigma). u-blox ZED-F9P and NEO-M9N data sheets: 1.5 m CEP without corrections.
+Source: ours. GNSS of a logged Pixhawk flight: 2.9 m off horizontally (median), nearly constant over 188 s: 2.5 m an
+axis (a Rayleigh distribution's median is 1.18 sigma).
 """
 
 from __future__ import annotations
@@ -83,9 +83,7 @@ class RelativeCuesSettings(Settings):
 class RelativeCues(Stage[RelativeCuesSettings]):
     """One `DroneCue` for each measurement of which everything needed is known."""
 
-    optional_inputs: ClassVar[frozenset[str]] = frozenset(
-        {"gnss", "global_position", "vehicle_gnss", "uwb", "motion"}
-    )
+    optional_inputs: ClassVar[frozenset[str]] = frozenset({"gnss", "global_position", "vehicle_gnss", "uwb", "motion"})
 
     def __init__(self, settings: RelativeCuesSettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)

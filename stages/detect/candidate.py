@@ -100,6 +100,7 @@ class Candidate:
     large_object_m: float = math.inf
     seen_ns: int = 0
     log_odds: float = 0.0  # newest result of the classifier, cues included
+    own_log_odds: float = 0.0  # without cues
     cue_nats: float | None = None  # what cues add to it; None: no cue yet
     cue_ns: int = 0  # when that was computed
     reason: str = ""  # for people

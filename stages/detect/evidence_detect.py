@@ -63,8 +63,10 @@ REVISITED_M = 0.5  # the same position
 MAX_STATIC = 64  # static objects remembered
 HYSTERESIS_NATS = 1.65  # an accepted candidate is rejected this far below the threshold
 AT_REST_MPS = np.zeros(3)
-COMPARED_NS = 500_000_000  # a cue is compared with an accepted candidate observed this recently,
+COMPARED_NS = 500_000_000  # a cue is compared with a candidate observed this recently,
 COMPARED_PASSES = 5  # in so many scan passes
+CUE_MARGIN_NATS = 0.5  # below the threshold of acceptance
+CUE_PASSES = 3  # scan passes without which cues accept no candidate: before, a repeated false return is possible
 STATIC_NS = 60_000_000_000  # how long a static object is remembered
 
 
@@ -168,15 +170,14 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
         self._now.telemetry.add_odometry(odometry)
 
     def on_cue(self, cue: DroneCue) -> CueState:
-        """Add a measurement of another sensor, and compare it with the drones that were accepted without cues."""
+        """Add a measurement of another sensor, and compare it with the drones that the LiDAR alone would accept."""
         now, accept = self._now, log_odds_of(self.settings.accept_probability)
         drones = [
             _object(c)
             for c in now.table
-            if c.accepted
-            and c.scan_passes >= COMPARED_PASSES
+            if c.scan_passes >= COMPARED_PASSES
             and abs(cue.stamp_ns - c.seen_ns) < COMPARED_NS
-            and c.log_odds - (c.cue_nats or 0.0) >= accept
+            and c.own_log_odds >= accept
         ]
         return now.cues.add(cue, now.trail, drones)
 
@@ -286,6 +287,7 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
         c.features = features_of(c, settings.span_m, motion_known)
         if settings.model is not None:
             c.log_odds, c.reason = settings.model.classify(c)
+        c.own_log_odds = c.log_odds
         self._add_cues(now, c)
         now.classified[c.number] = c
         accept = log_odds_of(settings.accept_probability)
@@ -299,11 +301,14 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
         nats, remark = now.cues.nats(_object(c), now.trail, c.stamp_ns)
         if not remark and c.cue_nats is None:
             return
-        if c.cue_nats is not None:
+        if remark and c.cue_nats is not None:
             since_s = (c.stamp_ns - c.cue_ns) * 1e-9
             nats = min(nats, c.cue_nats + self.settings.cues.recovery_nats_per_s * since_s)
+        if c.scan_passes < CUE_PASSES:
+            nats = min(nats, max(log_odds_of(self.settings.accept_probability) - CUE_MARGIN_NATS - c.log_odds, 0.0))
         c.cue_nats, c.cue_ns = nats, c.stamp_ns
-        c.log_odds += nats
+        observed = min(c.log_odds, log_odds_of(self.settings.follow_up_probability))
+        c.log_odds = max(c.log_odds + nats, observed)  # a cue that lies does not end the observation of the drone
         c.reason += f"; cues {nats:+.1f}" + (f" ({remark})" if remark else "")
 
     def _count_pass_throughs(self, now: _State, part: Slice, now_ns: int) -> None:

@@ -2,8 +2,9 @@
 
 Its estimate is the truth with the errors of `drift`, in a local frame with its origin at the start of the scenario and
 any north. Like ArduPilot it sends HEARTBEAT, ATTITUDE, LOCAL_POSITION_NED, ODOMETRY (LOCAL_FRD, BODY_FRD), RAW_IMU (mg,
-mrad/s) and a TIMESYNC request every 10 s, and replies to those of the host, which are recorded on /autopilot/tx. A
-message is sampled on the autopilot's clock, sent by its main loop a little later, and delayed by the radio.
+mrad/s), with a receiver GPS_RAW_INT and GLOBAL_POSITION_INT, and a TIMESYNC request every 10 s, and replies to those of
+the host, which are recorded on /autopilot/tx. A message is sampled on the autopilot's clock, sent by its main loop a
+little later, and delayed by the radio.
 
 Differences to a real flight (copter log of dronekit over a SiK telemetry radio; ours is the link of a companion):
   MAVLink 1; each message at 2.7 Hz, no ODOMETRY, no TIMESYNC; 45 gaps, the longest 18.8 s; a reboot during the log
@@ -34,6 +35,7 @@ from links.mavlink.ned_frd import (
 )
 from links.simulated.autopilot.flight_stack.settings import FlightStackSettings
 from links.simulated.autopilot.radio import Radio, RadioSettings
+from links.simulated.cues.cue_sensors import DroneReceiver
 from links.simulated.sensors.drift import STEP_S, DriftingEstimate, DriftSettings
 from links.simulated.world.flight import Flight, FlightSettings
 from stages.geometry.frames import Array64
@@ -79,7 +81,13 @@ class Autopilot:
     """All messages of the autopilot, and the TIMESYNC requests of the host, in the order of sending."""
 
     def __init__(
-        self, settings: AutopilotSettings, flight: Flight, start_ns: int, duration_s: float, seed: int
+        self,
+        settings: AutopilotSettings,
+        flight: Flight,
+        start_ns: int,
+        duration_s: float,
+        seed: int,
+        receiver: DroneReceiver | None = None,
     ) -> None:
         self._settings = settings
         self._start_ns = start_ns
@@ -104,6 +112,9 @@ class Autopilot:
             (1 / OWN_TIMESYNC_S, self._timesync_requests),
         )
         self._waiting: list[tuple[int, Any]] = []
+        if receiver is not None:
+            streams += ((receiver.settings.rate_hz, receiver.gps_raw),)
+            streams += ((receiver.settings.rate_hz if receiver.barometer else 0.0, receiver.global_positions),)
         for number, (rate_hz, messages) in enumerate(streams):
             self._plan(rate_hz, 0.0007 * number, duration_s, messages)
         self._requests: list[tuple[int, bytes]] = []

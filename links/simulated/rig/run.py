@@ -10,6 +10,7 @@ import heapq
 import itertools
 import time
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path as FilePath
 
 import numpy as np
@@ -18,9 +19,10 @@ from numpy.typing import NDArray
 from flow.link import TRUTH_TOPICS, LinkError, Record
 from links.lidar import packet_format
 from links.recording import RecordingWriter
-from links.simulated.autopilot.autopilot import Autopilot
+from links.simulated.autopilot.autopilot import Autopilot, AutopilotSettings
 from links.simulated.autopilot.flight_stack.outcome import Outcome
 from links.simulated.autopilot.flight_stack.stack import FlightStack
+from links.simulated.cues.cue_sensors import CueSensors, DroneReceiver, Poses, Positions
 from links.simulated.kernels.lidar import lidar_poses
 from links.simulated.pose_sensors.fix_sensor import FixSensor
 from links.simulated.pose_sensors.rotation_sensor import RotationSensor
@@ -94,7 +96,7 @@ class Simulation:
         drone = scenario.drone
         start_ns, duration_s = scenario.start_ns, scenario.duration_s
         drone_motion: Path | Flight | FlownMotion | None = drone.path if drone else None
-        self.telemetry_sources: list[Autopilot | FlightStack | VehicleOdometry | RotationSensor] = []
+        self.telemetry_sources: list[Autopilot | FlightStack | VehicleOdometry | RotationSensor | CueSensors] = []
         self.flight: FlightInTheLoop | None = None
         vehicle = scenario.vehicle
         vehicle_motion: Path | SuspendedPath = vehicle.path
@@ -109,11 +111,20 @@ class Simulation:
             self.telemetry_sources.append(self.flight.stack)
         elif drone is not None and scenario.autopilot is not None:
             drone_motion = Flight(drone.path, scenario.autopilot.flight, duration_s, self.seed)
-            self.telemetry_sources.append(Autopilot(scenario.autopilot, drone_motion, start_ns, duration_s, self.seed))
+            receiver = _receiver(self.scenario, drone_motion)
+            self.telemetry_sources.append(
+                Autopilot(scenario.autopilot, drone_motion, start_ns, duration_s, self.seed, receiver)
+            )
         if odometry is not None:
             self.telemetry_sources.append(odometry)
         others = scenario.other_drones
         self.truth = Truth(start_ns, vehicle_motion, drone_motion, tuple(other.path for other in others))
+        if scenario.cues is not None:
+            drones = _drones_of(self.scenario, drone_motion)
+            poses: Poses = vehicle_motion.level_poses
+            self.telemetry_sources.append(
+                CueSensors(scenario.cues, poses, drones, _heading_deg(scenario), start_ns, duration_s, self.seed)
+            )
         height = scenario.vehicle.camera_height_m
         world = scenario_world(self.scenario)
         self._scene = Scene(
@@ -279,6 +290,38 @@ class Simulation:
             arrival_ns = int(last_pulse_ns[i] + jitter_ns[i])
             records.append(Record("/lidar/packets", arrival_ns=arrival_ns, stamp_ns=at // 1000 * 1000, data=data))
         return records + self._truth_records.hits(pulse_ns.reshape(packets, -1), pulses)
+
+
+def _heading_deg(scenario: Scenario) -> float:
+    """Heading of the world's x axis, clockwise from north."""
+    return (scenario.autopilot or AutopilotSettings()).heading_of_world_x_deg
+
+
+def _drones_of(scenario: Scenario, first: Path | Flight | FlownMotion | None) -> tuple[Positions, ...]:
+    """Positions of all drones, the first one as flown."""
+    if first is None:
+        return ()
+    return (lambda time_s: first.at(time_s)[0], *(partial(_planned_m, other.path) for other in scenario.other_drones))
+
+
+def _planned_m(path: Path, time_s: Array64) -> Array64:
+    return path.at(time_s)[0]
+
+
+def _receiver(scenario: Scenario, flight: Flight) -> DroneReceiver | None:
+    """The drone's GNSS receiver and barometer; None: it has none."""
+    cues = scenario.cues
+    if cues is None or cues.drone is None:
+        return None
+    return DroneReceiver(
+        cues.drone,
+        cues.barometer,
+        _drones_of(scenario, flight),
+        -scenario.vehicle.camera_height_m,
+        _heading_deg(scenario),
+        scenario.duration_s,
+        scenario.seed,
+    )
 
 
 def simulate_records(scenario: Scenario, seed: int | None = None) -> Iterator[Record]:

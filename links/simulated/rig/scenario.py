@@ -17,6 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from flow.config.tree import load_tree, resolve
 from flow.config_error import ConfigError, did_you_mean
 from links.simulated.autopilot.autopilot import AutopilotSettings
+from links.simulated.cues.cue_errors import CueSettings
 from links.simulated.pose_sensors.fix_sensor import FixSensorSettings
 from links.simulated.pose_sensors.rotation_sensor import RotationSensorSettings
 from links.simulated.rig.closed_loop import ClosedLoopSettings
@@ -105,6 +106,7 @@ class Scenario(_ScenarioSettings):
     cameras: CamerasSettings = CamerasSettings()
     autopilot: AutopilotSettings | None = None  # with it the drone obeys flight dynamics; without, it follows its path
     vehicle_odometry: VehicleOdometrySettings | None = None
+    cues: CueSettings | None = None  # GNSS, ranging, barometer
     script: tuple[Segment, ...] = ()
     closed_loop: ClosedLoopSettings = ClosedLoopSettings()  # replaces the script with --closed-loop
     lidar_gaps_s: tuple[tuple[float, float], ...] = ()  # (from, to): no packet of the LiDAR arrives
@@ -157,6 +159,22 @@ class Scenario(_ScenarioSettings):
                 if separation.min() < (drone.span_m + other.span_m) / 2:
                     raise ValueError(f"{name}.path: collides with {other_name} at {times[separation.argmin()]:.2f} s")
             checked.append((name, drone, at_m))
+        return self
+
+    @model_validator(mode="after")
+    def _cues_are_possible(self) -> Self:
+        cues = self.cues
+        if cues is None:
+            return self
+        if (cues.drone or cues.barometer) and self.autopilot is None:
+            raise ValueError("cues: the drone's receiver and barometer report through its autopilot; add one")
+        if self.autopilot is not None and self.autopilot.flight_stack is not None:
+            raise ValueError("cues: not with flight_stack; its flight is not known in advance")
+        if cues.barometer is not None and cues.drone is None:
+            raise ValueError("cues.barometer: it reports at the rate of cues.drone; add that, as {rate_hz: 5}")
+        for source in (cues.drone, cues.ranging):
+            if source is not None and source.of_drone > len(self._drones()):
+                raise ValueError(f"cues: of_drone is {source.of_drone}, the scenario has {len(self._drones())} drones")
         return self
 
     def _drones(self) -> list[tuple[str, DroneSettings]]:

@@ -1,0 +1,89 @@
+"""The sector of the search by a cue, and that a wrong cue does not prevent the search."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from stages.aim import BeamAim
+from stages.aim.search_sector import SECTOR_PASSES, WHOLE_PASSES, SearchSector, sector_rad
+from stages.messages import CueState
+from tests.stages.aim.test_beam_aim import fly
+from tests.stages.made import ON_ITS_SIDE, START_NS
+
+TRAVEL_RAD = (0.0, math.pi)
+FAR_M = np.array([-20.0, 20.0, 15.0])  # at 135 deg
+P_M2 = 9.0 * np.eye(3)
+
+
+def test_the_sector_is_about_the_direction_of_the_cue():
+    low, high = sector_rad(ON_ITS_SIDE, TRAVEL_RAD, FAR_M, P_M2) or (0.0, 0.0)
+    assert (low + high) / 2 == pytest.approx(math.radians(135.0), abs=0.02)
+    assert (high - low) / 2 == pytest.approx(math.asin(7.0 / (20.0 * math.sqrt(2.0))), abs=0.03)  # 2 sigma and a margin
+
+
+def test_turning_cue_and_covariance_by_180_deg_changes_nothing():
+    opposite = FAR_M * [-1.0, -1.0, 1.0]
+    assert sector_rad(ON_ITS_SIDE, TRAVEL_RAD, opposite, P_M2) == sector_rad(ON_ITS_SIDE, TRAVEL_RAD, FAR_M, P_M2)
+
+
+def test_a_more_precise_cue_gives_a_narrower_sector_and_one_overhead_none():
+    wide, narrow = (sector_rad(ON_ITS_SIDE, TRAVEL_RAD, FAR_M, s * P_M2) for s in (1.0, 0.1))
+    assert wide is not None
+    assert narrow is not None
+    assert narrow[1] - narrow[0] < wide[1] - wide[0]
+    assert sector_rad(ON_ITS_SIDE, TRAVEL_RAD, np.array([0.5, 0.5, 20.0]), P_M2) is None
+
+
+def test_the_whole_travel_follows_some_passes_of_the_sector():
+    sector = SearchSector(ON_ITS_SIDE, TRAVEL_RAD)
+    sector.update(START_NS, FAR_M, P_M2)
+    whole = [sector.limits(START_NS, passes) == TRAVEL_RAD for passes in range(2 * (SECTOR_PASSES + WHOLE_PASSES))]
+    assert whole == 2 * (SECTOR_PASSES * [False] + WHOLE_PASSES * [True])
+
+
+def test_without_a_recent_or_trusted_cue_the_whole_travel_is_searched():
+    sector = SearchSector(ON_ITS_SIDE, TRAVEL_RAD)
+    assert sector.limits(START_NS, 0) == TRAVEL_RAD
+    sector.update(START_NS, FAR_M, P_M2)
+    assert sector.limits(START_NS + 2_000_000_000, 0) == TRAVEL_RAD
+    sector.update(START_NS, FAR_M, P_M2)
+    sector.withdraw()
+    assert sector.limits(START_NS, 0) == TRAVEL_RAD
+
+
+def cue_state(t_s: float, xyz_m=FAR_M, trusted: bool = True) -> CueState:
+    return CueState(
+        stamp_ns=START_NS + round(1e9 * t_s),
+        source="gnss",
+        trusted=trusted,
+        reason="made",
+        bias_m=np.zeros(3),
+        bias_sigma_m=3.0,
+        offset_m=math.nan,
+        xyz_vehicle_m=xyz_m if trusted else None,
+        covariance_m2=P_M2 if trusted else None,
+    )
+
+
+def test_the_servo_goes_to_the_sector_at_full_speed_and_sweeps_it_before_the_rest():
+    aim = BeamAim(mount=ON_ITS_SIDE)
+    flight = fly(aim, 4.0, lambda aim, t_s: aim.on_cue(cue_state(t_s)))
+    low, high = sector_rad(ON_ITS_SIDE, TRAVEL_RAD, FAR_M, P_M2) or (0.0, 0.0)
+    _, first = flight.goals[0]
+    assert first.position_rad == pytest.approx(low)
+    assert first.speed_radps == pytest.approx(55 * math.tau / 60)
+    reached = flight.ends_reached()
+    assert reached[1 : SECTOR_PASSES + 1] == pytest.approx(2 * [high, low], abs=2e-3)
+    assert {0.0, round(math.pi, 3)} <= set(reached)
+
+
+def test_a_cue_that_is_no_longer_trusted_frees_the_sweep():
+    def publish(aim: BeamAim, t_s: float) -> None:
+        aim.on_cue(cue_state(t_s, trusted=t_s < 0.5))
+
+    flight = fly(BeamAim(mount=ON_ITS_SIDE), 2.5, publish)
+    assert {0.0, round(math.pi, 3)} & set(flight.ends_reached())
+    assert flight.goals[-1][1].position_rad in (0.0, pytest.approx(math.pi))

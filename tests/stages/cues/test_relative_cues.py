@@ -1,0 +1,155 @@
+"""RelativeCues: GNSS differences in the axes of map, ranges, heights; what it does not use."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from flow.message import check_arrays
+from stages.cues import RelativeCues
+from stages.cues.geodesy import Geographic, displacement_enu_m, moved
+from stages.geometry.frames import rotation_z
+from stages.messages import CueKind, DroneGlobalPosition, DroneGnss, UwbRange, VehicleGnss, VehicleMotion
+from tests.stages.made import START_NS
+
+TOKYO = Geographic(math.radians(35.66), math.radians(139.70), 40.0)
+LATENCY_S = 0.2
+NORTH_RAD = 0.6  # yaw of east-north-up in map
+
+
+def at(t_s: float) -> int:
+    return START_NS + round(1e9 * t_s)
+
+
+def place(xyz_map_m) -> Geographic:
+    return moved(TOKYO, rotation_z(-NORTH_RAD) @ np.asarray(xyz_map_m, dtype=np.float64))
+
+
+def vehicle(t_s: float, xyz_map_m=(0.0, 0.0, 0.0), yaw_map_rad: float | None = 0.0) -> VehicleGnss:
+    """As its receiver reports it: LATENCY_S late."""
+    return VehicleGnss(
+        stamp_ns=at(t_s + LATENCY_S),
+        **place(xyz_map_m)._asdict(),
+        sigma_m=None,
+        sigma_up_m=None,
+        yaw_enu_rad=None if yaw_map_rad is None else yaw_map_rad - NORTH_RAD,
+        yaw_sigma_rad=math.radians(1.0),
+    )
+
+
+def drone(t_s: float, xyz_map_m) -> DroneGnss:
+    return DroneGnss(stamp_ns=at(t_s + LATENCY_S), **place(xyz_map_m)._asdict(), sigma_m=None, sigma_up_m=None)
+
+
+def motion(t_s: float, xyz_map_m, yaw_rad: float = 0.0) -> VehicleMotion:
+    xyz = np.asarray(xyz_map_m, dtype=np.float64)
+    return VehicleMotion(stamp_ns=at(t_s), xyz_map_m=xyz, R_map_vehicle=rotation_z(yaw_rad), covariance=None)
+
+
+@pytest.mark.parametrize("latitude_deg", [-60.0, 0.0, 35.0, 80.0])
+def test_a_displacement_and_a_move_are_inverse(latitude_deg):
+    origin = Geographic(math.radians(latitude_deg), math.radians(179.9999), 500.0)  # beside the antimeridian
+    enu_m = np.array([120.0, -310.0, 45.0])
+    assert displacement_enu_m(origin, moved(origin, enu_m)) == pytest.approx(enu_m, abs=1e-3)
+
+
+def test_a_degree_of_latitude_and_longitude_has_the_length_of_the_ellipsoid():
+    """Tables of WGS84 at 45 deg: 111 131.8 m and 78 846.8 m per degree."""
+    south, north = (Geographic(math.radians(45 + d), 0.0, 0.0) for d in (-0.05, 0.05))
+    east = Geographic(math.radians(45), math.radians(0.1), 0.0)
+    assert displacement_enu_m(south, north)[1] == pytest.approx(11_113.18, abs=0.1)
+    assert displacement_enu_m(Geographic(math.radians(45), 0.0, 0.0), east)[0] == pytest.approx(7_884.68, abs=0.1)
+
+
+def test_gnss_of_both_with_a_heading_gives_the_position_in_the_axes_of_map():
+    stage = RelativeCues()
+    stage.on_vehicle_gnss(vehicle(0.0))
+    cue = stage.on_gnss(drone(0.0, (12.0, -5.0, 9.0)))
+    assert cue is not None
+    check_arrays(cue)
+    assert (cue.kind, cue.source, cue.stamp_ns) == (CueKind.POSITION, "gnss", at(0.0))
+    assert cue.value_m == pytest.approx([12.0, -5.0, 9.0], abs=0.01)
+
+
+def test_turning_the_world_turns_nothing_in_map():
+    """The vehicle's own yaw in map and its heading cancel."""
+    stage = RelativeCues()
+    stage.on_motion(motion(0.0, (0.0, 0.0, 0.0), yaw_rad=1.1))
+    stage.on_vehicle_gnss(vehicle(0.0, yaw_map_rad=1.1))
+    cue = stage.on_gnss(drone(0.0, (12.0, -5.0, 9.0)))
+    assert cue is not None
+    assert cue.value_m == pytest.approx([12.0, -5.0, 9.0], abs=0.01)
+
+
+def test_without_a_heading_a_parked_vehicle_gives_distance_and_height_only():
+    stage = RelativeCues()
+    stage.on_vehicle_gnss(vehicle(0.0, yaw_map_rad=None))
+    cue = stage.on_gnss(drone(0.0, (12.0, -5.0, 9.0)))
+    assert cue is not None
+    assert cue.kind is CueKind.LEVEL_AND_HEIGHT
+    assert cue.value_m == pytest.approx([13.0, 9.0], abs=0.01)
+
+
+def test_the_course_of_a_driving_vehicle_gives_north():
+    stage = RelativeCues()
+    for step in range(40):
+        t_s, x_m = 0.2 * step, 5.0 * 0.2 * step
+        stage.on_motion(motion(t_s, (x_m, 0.0, 0.0)))
+        stage.on_vehicle_gnss(vehicle(t_s, (x_m, 0.0, 0.0), yaw_map_rad=None))
+    cue = stage.on_gnss(drone(7.8, (39.0 + 12.0, -5.0, 9.0)))
+    assert cue is not None
+    assert cue.kind is CueKind.POSITION
+    assert cue.value_m == pytest.approx([12.0, -5.0, 9.0], abs=0.05)
+    assert cue.bias_covariance_m2[1, 1] > cue.bias_covariance_m2[0, 0]  # the yaw's error acts across the direction
+
+
+def test_the_vehicles_motion_between_both_measurements_counts():
+    stage = RelativeCues()
+    for t_s in (0.0, 0.4):
+        stage.on_motion(motion(t_s, (10.0 * t_s, 0.0, 0.0)))
+    stage.on_vehicle_gnss(vehicle(0.0))
+    cue = stage.on_gnss(drone(0.4, (12.0, 0.0, 9.0)))
+    assert cue is not None
+    assert cue.value_m == pytest.approx([8.0, 0.0, 9.0], abs=0.01)
+
+
+def test_gnss_that_is_too_old_or_of_another_place_is_not_used():
+    stage = RelativeCues()
+    assert stage.on_gnss(drone(0.0, (1.0, 2.0, 3.0))) is None
+    stage.on_vehicle_gnss(vehicle(0.0))
+    assert stage.on_gnss(drone(1.6, (1.0, 2.0, 3.0))) is None
+    assert stage.on_gnss(drone(0.2, (900.0, 2.0, 3.0))) is None
+    assert sum(stage.counters.values()) == 3
+
+
+def test_the_autopilots_position_replaces_a_silent_receiver_and_never_after_a_sent_pose():
+    position = DroneGlobalPosition(
+        stamp_ns=at(LATENCY_S), **place((4.0, 3.0, 9.0))._asdict(), altitude_above_home_m=10.0, independent=True
+    )
+    stage = RelativeCues(altitude={"home_up_m": -1.8})
+    stage.on_vehicle_gnss(vehicle(0.0))
+    sources = {cue.source: cue for cue in stage.on_global_position(position)}
+    assert sources["altitude"].value_m == pytest.approx([8.2])
+    assert sources["gnss"].value_m == pytest.approx([4.0, 3.0, 9.0], abs=0.01)
+    stage.on_gnss(drone(0.0, (4.0, 3.0, 9.0)))
+    assert [cue.source for cue in stage.on_global_position(position)] == ["altitude"]
+    echo = DroneGlobalPosition(stamp_ns=at(0.3), **place((0.0, 0.0, 9.0))._asdict(), altitude_above_home_m=10.0)
+    assert stage.on_global_position(echo) == []
+
+
+def test_a_range_is_measured_from_the_device_on_the_turned_vehicle():
+    stage = RelativeCues(uwb={"anchor_vehicle_m": (1.0, 0.0, 0.5)})
+    stage.on_motion(motion(0.0, (5.0, 5.0, 0.0), yaw_rad=math.pi / 2))
+    cue = stage.on_uwb(UwbRange(stamp_ns=at(0.02), range_m=17.0, sigma_m=0.4))
+    assert cue is not None
+    assert cue.reference_map_m == pytest.approx([0.0, 1.0, 0.5])
+    assert cue.covariance_m2[0, 0] == pytest.approx(0.16)
+
+
+def test_a_cue_that_is_null_is_not_used():
+    stage = RelativeCues(gnss=None, uwb=None, altitude=None)
+    stage.on_vehicle_gnss(vehicle(0.0))
+    assert stage.on_gnss(drone(0.0, (1.0, 2.0, 3.0))) is None
+    assert stage.on_uwb(UwbRange(stamp_ns=at(0.0), range_m=17.0, sigma_m=None)) is None

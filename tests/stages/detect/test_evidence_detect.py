@@ -156,9 +156,10 @@ def reasons_of(candidates):
 
 
 def test_ports_are_what_the_graph_wires():
-    assert set(input_ports(EvidenceDetect)) == {"motion", "pulses", "drone_position", "drone_odometry"}
-    assert set(output_ports(EvidenceDetect)) == {"candidate_log", "candidates", "detections"}
-    assert EvidenceDetect.optional_inputs == {"motion", "drone_position", "drone_odometry"}
+    optional = {"motion", "drone_position", "drone_odometry", "cue"}
+    assert set(input_ports(EvidenceDetect)) == {"pulses", *optional}
+    assert set(output_ports(EvidenceDetect)) == {"candidate_log", "candidates", "detections", "cue_state"}
+    assert EvidenceDetect.optional_inputs == optional
 
 
 @pytest.mark.parametrize("seed", range(2))

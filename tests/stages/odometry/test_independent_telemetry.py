@@ -13,6 +13,7 @@ from stages.geometry.frames import rotation_z
 from stages.kernels.geometry.so3 import exp_rotation
 from stages.messages import (
     DroneAttitude,
+    DroneGlobalPosition,
     DroneImu,
     DroneLocalPosition,
     DroneOdometry,
@@ -53,6 +54,19 @@ def odometry(independent: bool) -> DroneOdometry:
 
 def imu(stamp_ns: int) -> DroneImu:
     return DroneImu(stamp_ns=stamp_ns, acceleration_drone_mps2=np.array([0, 0, 9.8]), angular_velocity_drone_radps=GYRO)
+
+
+def global_position(independent: bool) -> DroneGlobalPosition:
+    return DroneGlobalPosition(
+        stamp_ns=5, latitude_rad=0.6, longitude_rad=2.4, altitude_m=9.0, altitude_above_home_m=5.0, independent=independent
+    )
+
+
+def test_a_geographic_position_passes_only_while_it_is_independent():
+    stage = IndependentTelemetry()
+    assert stage.on_global_position(own := global_position(True)) is own
+    assert stage.on_global_position(global_position(False)) is None
+    assert stage.counters == {"not independent": 1}
 
 
 def test_an_independent_estimate_passes_unchanged():

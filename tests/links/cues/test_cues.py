@@ -1,0 +1,130 @@
+"""The link of cues: JSON and NMEA datagrams, senders, and everything that is no cue."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from flow.link import LinkError, Record
+from links.cues import Cues
+from links.cues.parsing import CueParser
+from stages.messages import DroneGnss, UwbRange, VehicleGnss
+from tests.links import ports
+
+STAMP_NS = 1_748_773_230_000_000_000
+PLACE = {"latitude_deg": 35.66, "longitude_deg": 139.7, "altitude_m": 40.0}
+
+
+def sentence(body: str) -> bytes:
+    checksum = 0
+    for byte in body.encode():
+        checksum ^= byte
+    return f"${body}*{checksum:02X}\r\n".encode()
+
+
+GGA = sentence("GNGGA,123519,4807.038,N,01131.000,W,1,08,0.9,545.4,M,46.9,M,,")
+
+
+def parse(content: object):
+    data = content if isinstance(content, bytes) else json.dumps(content).encode()
+    return CueParser().parse(STAMP_NS, data)
+
+
+def test_each_cue_is_read():
+    (vehicle,) = parse({"vehicle_gnss": PLACE | {"sigma_m": 1.5, "heading_deg": 80.0, "heading_sigma_deg": 2.0}})
+    assert isinstance(vehicle, VehicleGnss)
+    assert math.degrees(vehicle.latitude_rad) == pytest.approx(35.66)
+    assert (vehicle.sigma_m, vehicle.sigma_up_m) == (1.5, None)
+    assert math.degrees(vehicle.yaw_enu_rad) == pytest.approx(10.0)  # a heading of 80 deg is 10 deg north of east
+    assert math.degrees(vehicle.yaw_sigma_rad) == pytest.approx(2.0)
+    (drone,) = parse({"drone_gnss": PLACE, "age_s": 0.1})
+    assert isinstance(drone, DroneGnss)
+    assert math.degrees(drone.longitude_rad) == pytest.approx(139.7)
+    (uwb,) = parse({"uwb_range": {"range_m": 17.25}})
+    assert isinstance(uwb, UwbRange)
+    assert (uwb.range_m, uwb.sigma_m) == (17.25, None)
+
+
+def test_nmea_gives_position_and_the_heading_of_the_last_second():
+    parser = CueParser()
+    assert parser.parse(STAMP_NS, sentence("GNHDT,274.07,T")) == []
+    (gnss,) = parser.parse(STAMP_NS + 500_000_000, GGA)
+    assert isinstance(gnss, VehicleGnss)
+    assert math.degrees(gnss.latitude_rad) == pytest.approx(48 + 7.038 / 60)
+    assert math.degrees(gnss.longitude_rad) == pytest.approx(-(11 + 31.0 / 60))
+    assert gnss.altitude_m == 545.4
+    assert math.degrees(gnss.yaw_enu_rad) == pytest.approx(360 + 90 - 274.07)
+    (later,) = parser.parse(STAMP_NS + 1_500_000_000, GGA)
+    assert later.yaw_enu_rad is None
+
+
+def test_nmea_without_a_fix_and_other_sentences_are_no_cue():
+    assert parse(sentence("GNGGA,123519,,,,,0,,,,,,,,")) == []
+    assert parse(sentence("GNVTG,054.7,T,,M,005.5,N,010.2,K")) == []
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        (b"", "neither JSON nor NMEA"),
+        (b"\xff\xfe", "neither JSON nor NMEA"),
+        (b"[" * 1500, "neither JSON nor NMEA"),
+        (b" " * 3000, "longer"),
+        ([1, 2], "no JSON object"),
+        ({"other": 1}, "unknown cue"),
+        ({"vehicle_gnss": 5}, "latitude_deg"),
+        ({"vehicle_gnss": PLACE | {"latitude_deg": 91}}, "out of its range"),
+        ({"vehicle_gnss": PLACE | {"altitude_m": None}}, "altitude_m"),
+        ({"vehicle_gnss": PLACE | {"sigma_m": -1}}, "out of its range"),
+        ({"vehicle_gnss": PLACE | {"heading_deg": "80"}}, "heading_deg"),
+        (b'{"uwb_range": {"range_m": NaN}}', "out of its range"),
+        (b'{"uwb_range": {"range_m": 1e999}}', "out of its range"),
+        ({"uwb_range": {"range_m": True}}, "range_m"),
+        ({"uwb_range": {"range_m": 2000}}, "out of its range"),
+        (GGA.replace(b"545.4", b"545.5"), "checksum"),
+        (sentence("GNGGA,123519,4807.038,N"), "cut off"),
+        (sentence("GNGGA,123519,4807.038,X,01131.000,W,1,08,0.9,545.4,M,46.9,M,,"), "hemisphere"),
+        (sentence("GNGGA,123519,nan,N,01131.000,W,1,08,0.9,545.4,M,46.9,M,,"), "out of its range"),
+        (sentence("GNHDT,,T"), "without a number"),
+    ],
+)
+def test_what_is_no_cue_is_rejected_with_a_reason(content, reason):
+    with pytest.raises(ValueError, match=reason):
+        parse(content)
+
+
+@given(st.binary(max_size=200) | st.binary(max_size=60).map(lambda tail: b"$GNGGA," + tail))
+def test_no_bytes_raise_anything_but_are_counted(data):
+    cues = Cues()
+    found = list(cues.decode(Record("/cues", STAMP_NS, STAMP_NS, data)))
+    assert len(found) + sum(cues.counters.rejected.values()) <= 1
+
+
+def test_a_cue_arrives_by_udp_stamped_by_its_age_and_others_senders_are_ignored():
+    port = ports.free_port()
+    cues = Cues(port=port, sender="127.0.0.1")
+    with cues.listen() as records:
+        ports.send(port, b'{"uwb_range": {"range_m": 5}}', host="127.0.0.2")
+        ports.send(port, json.dumps({"uwb_range": {"range_m": 7}, "age_s": 0.25}).encode(), host="127.0.0.1")
+        ports.send(port, GGA, host="127.0.0.1")
+        ranged, nmea = next(records), next(records)
+    assert ranged.arrival_ns - ranged.stamp_ns == 250_000_000
+    assert [cue.range_m for cue in cues.decode(ranged)] == [7.0]
+    assert len(list(cues.decode(nmea))) == 1
+    assert cues.counters["from other senders"] == 1
+
+
+def test_beyond_loopback_a_sender_is_required():
+    with pytest.raises(ValidationError, match="sender"):
+        Cues(port=1234, bind="0.0.0.0")
+    Cues(port=1234, bind="0.0.0.0", sender="192.168.1.9")
+
+
+def test_without_a_port_there_are_no_live_cues():
+    with pytest.raises(LinkError, match="set `port`"):
+        Cues().listen()

@@ -7,9 +7,10 @@ Source: recording format in recordings/README.md (/cues).
 
 from __future__ import annotations
 
+import dataclasses
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import AbstractContextManager
+from contextlib import contextmanager
 from ipaddress import IPv4Address
 from typing import Any
 
@@ -20,6 +21,8 @@ from flow.link import LinkError, Record, Source, SourceSettings
 from links.cues.parsing import CueParser
 from links.vehicle_odometry.udp import listen_udp
 from stages.messages import DroneGnss, UwbRange, VehicleGnss
+
+NMEA_SUFFIX = "/nmea"  # topic of NMEA datagrams: a recording declares one encoding per topic
 
 
 class CuesSettings(SourceSettings):
@@ -52,13 +55,20 @@ class Cues(Source[CuesSettings]):
         """Totals since the start: cues, from other senders; rejected by reason."""
         return Counters({"cues": self._decoded} | dict(self._udp), self._rejected)
 
-    def listen(self) -> AbstractContextManager[Iterator[Record]]:
+    @property
+    def replay_topics(self) -> tuple[str, ...]:
+        """See Source."""
+        return self.settings.topic, self.settings.topic + NMEA_SUFFIX
+
+    @contextmanager
+    def listen(self) -> Iterator[Iterator[Record]]:
         """Receive cues: `with cues.listen() as records`. LinkError without `port`, or when it cannot be opened."""
         settings = self.settings
         if settings.port is None:
             raise LinkError(f"{settings.topic}: set `port` to receive cues, or remove the link")
         sender = None if settings.sender is None else str(settings.sender)
-        return listen_udp(settings.topic, str(settings.bind), settings.port, sender, self._udp, "cues")
+        with listen_udp(settings.topic, str(settings.bind), settings.port, sender, self._udp, "cues") as records:
+            yield (_on_its_topic(record) for record in records)
 
     def decode(self, record: Record) -> Iterator[VehicleGnss | DroneGnss | UwbRange]:
         """The cues of one datagram; none of an invalid one."""
@@ -69,3 +79,8 @@ class Cues(Source[CuesSettings]):
             return
         self._decoded += len(found)
         yield from found
+
+
+def _on_its_topic(record: Record) -> Record:
+    is_nmea = record.data.startswith(b"$")
+    return dataclasses.replace(record, topic=record.topic + NMEA_SUFFIX) if is_nmea else record

@@ -14,7 +14,9 @@ Source: MCAP specification 0 (https://mcap.dev/spec); the topics are ours.
 
 from __future__ import annotations
 
+import dataclasses
 import json
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -22,7 +24,7 @@ from typing import Any
 from links.recording.compressed_image import COMPRESSED_IMAGE_SCHEMA
 
 PROFILE = "grd"
-FORMAT_VERSION = (1, 0)  # a reader refuses a newer major; a minor only adds topics or metadata
+FORMAT_VERSION = (1, 1)  # a reader refuses a newer major; a minor only adds topics or metadata
 METADATA_FORMAT = "grd"
 METADATA_USER = "recording"
 METADATA_LOSSES = "losses"
@@ -67,8 +69,9 @@ def _raw(name: str, encoding: str, holds: str) -> Topic:
     return Topic(name=name, holds=holds, encoding=encoding)
 
 
-def _json(name: str, schema_name: str, fields: dict[str, Any], holds: str) -> Topic:
-    schema = {"title": schema_name, "type": "object", "properties": fields, "required": list(fields)}
+def _json(name: str, schema_name: str, fields: dict[str, Any], holds: str, optional: bool = False) -> Topic:
+    """A topic of JSON objects. `optional`: an object has some of the fields only."""
+    schema = {"title": schema_name, "type": "object", "properties": fields, "required": [] if optional else [*fields]}
     text = json.dumps(schema, separators=(",", ":")).encode()
     return Topic(name, holds, "json", schema_name, "jsonschema", text)
 
@@ -78,6 +81,41 @@ def _jpeg(name: str, holds: str) -> Topic:
         name, holds, "protobuf", "foxglove.CompressedImage", "protobuf", COMPRESSED_IMAGE_SCHEMA, compress=False
     )
 
+
+_NUMBER, _NUMBER_OR_NULL = {"type": "number"}, {"type": ["number", "null"]}
+_GNSS = {
+    "type": "object",
+    "properties": {
+        "latitude_deg": _NUMBER,
+        "longitude_deg": _NUMBER,
+        "altitude_m": {"type": "number", "description": "above mean sea level"},
+        "sigma_m": _NUMBER,
+        "sigma_up_m": _NUMBER,
+        "heading_deg": {"type": "number", "description": "clockwise from true north; of the vehicle only"},
+        "heading_sigma_deg": _NUMBER,
+    },
+    "required": ["latitude_deg", "longitude_deg", "altitude_m"],
+}
+_RANGE = {"type": "object", "properties": {"range_m": _NUMBER, "sigma_m": _NUMBER}, "required": ["range_m"]}
+_CUES = {"vehicle_gnss": _GNSS, "drone_gnss": _GNSS, "uwb_range": _RANGE, "age_s": _NUMBER}
+_HITS = {"pulse_stamp_ns": {"type": "array", "items": {"type": "integer"}}}
+_FLIGHT = {
+    "crashed": {"type": "boolean"},
+    "failsafe_s": _NUMBER_OR_NULL,
+    "lost_s": _NUMBER_OR_NULL,
+    "sent_poses": {"type": "integer"},
+    "wrong_poses": {"type": "integer"},
+    "events": {"type": "array"},
+}
+_FIX = {
+    "tick": {"type": "boolean"},
+    "xyz_m": _XYZ,
+    "velocity_mps": _XYZ | {"description": "[m/s]"},
+    "sigma_m": _NUMBER,
+    "bias_sigma_m": _NUMBER,
+}
+_ROTATION = {"R": {"type": "array", "items": {"type": "array", "items": _NUMBER}}, "sigma_rad": _NUMBER}
+_NUMBERED = re.compile(r"(/truth/\w+?)_\d+")  # of a second drone, and so on
 
 _SERVO = {
     "position_rad": {"type": "number"},
@@ -102,15 +140,28 @@ TOPICS: dict[str, Topic] = {
             {**_POSE, "covariance": _COVARIANCE},
             "the vehicle's own odometry, when it has one",
         ),
+        _json("/cues", "grd.Cues", _CUES, "GNSS of vehicle and drone, ranges: one of them", optional=True),
+        _raw("/cues/nmea", "nmea", "NMEA sentences of the vehicle's GNSS receiver"),
         _raw("/clock", "empty", "empty: a tick of the host's clock in a live run"),
         _raw("/run/order", "grd-order", "order of the inputs of each stage, live runs only: flow/live/input_order.py"),
         _json("/run/end", "grd.RunEnd", {"output_hash": {"type": "string"}}, "the live run's hash, written at its end"),
         _json("/truth/vehicle", "grd.Pose", _POSE, "T_world_vehicle; simulated only, never wired to a stage"),
         _json("/truth/drone", "grd.Pose", _POSE, "T_world_drone; simulated only, never wired to a stage"),
+        _json("/truth/hits", "grd.Hits", _HITS, "pulses of one LiDAR packet that the drone returned; simulated only"),
+        _json("/truth/visible", "grd.Visible", {"visible": {"type": "boolean"}}, "line of sight; simulated only"),
+        _json("/truth/flight", "grd.Flight", _FLIGHT, "outcome of a flight with an autopilot in the loop"),
+        _json("/simulated/fixes", "grd.SimulatedFix", _FIX, "fixes in place of the LiDAR, and ticks", optional=True),
+        _json("/simulated/rotations", "grd.SimulatedRotation", _ROTATION, "rotations in place of the cameras"),
     )
 }
 
 
 def topic(name: str) -> Topic:
-    """Declaration of a topic; a topic that is not in the table holds raw bytes."""
+    """Declaration of a topic; a topic that is not in the table holds raw bytes.
+
+    `/truth/drone_2` of a second drone is declared as `/truth/drone`.
+    """
+    numbered = _NUMBERED.fullmatch(name)
+    if numbered is not None and (first := TOPICS.get(numbered[1])) is not None:
+        return dataclasses.replace(first, name=name)
     return TOPICS.get(name) or _raw(name, "application/octet-stream", "raw bytes of a topic that grd does not know")

@@ -234,8 +234,8 @@ def main() -> None:
         for cell, seed, variant in itertools.product(cells(arguments.only or ["*"]), seeds, arguments.variants)
         if ("another" not in variant or cell.motion == "two") and (cell.name, seed, variant) not in made
     ]
-    for first in range(0, len(flights), 4 * arguments.jobs):
-        for row in run_all(fly, flights[first : first + 4 * arguments.jobs], arguments.jobs, lambda _: None):
+    for first in range(0, len(flights), arguments.jobs):
+        for row in run_all(fly, flights[first : first + arguments.jobs], arguments.jobs, lambda _: None):
             if row is not None:
                 rows.append(row)
                 with file.open("a", encoding="utf-8") as stream:

@@ -116,6 +116,7 @@ def test_a_cue_arrives_by_udp_stamped_by_its_age_and_others_senders_are_ignored(
     assert ranged.arrival_ns - ranged.stamp_ns == 250_000_000
     assert [cue.range_m for cue in cues.decode(ranged)] == [7.0]
     assert len(list(cues.decode(nmea))) == 1
+    assert [record.topic for record in (ranged, nmea)] == list(cues.replay_topics)
     assert cues.counters["from other senders"] == 1
 
 
@@ -126,5 +127,5 @@ def test_beyond_loopback_a_sender_is_required():
 
 
 def test_without_a_port_there_are_no_live_cues():
-    with pytest.raises(LinkError, match="set `port`"):
-        Cues().listen()
+    with pytest.raises(LinkError, match="set `port`"), Cues().listen():
+        pass

@@ -144,7 +144,7 @@ def test_the_mcap_package_reads_it(tmp_path: Path):
         assert summary.statistics is not None
         assert [(a.name, a.data) for a in oracle.iter_attachments()] == [("rig.yaml", b"version: 1\n")]
         assert {m.name: m.metadata for m in oracle.iter_metadata()} == {
-            "grd": {"format_version": "1.0"},
+            "grd": {"format_version": "1.1"},
             "recording": {"a": "b"},
         }
     assert [(c.topic, m.log_time, m.publish_time, m.sequence, m.data) for _, c, m in got] == [
@@ -156,7 +156,8 @@ def test_the_mcap_package_reads_it(tmp_path: Path):
         assert (schema.name if schema else "") == topic.schema_name
         if schema and topic.encoding == "json":
             assert schema.encoding == "jsonschema"
-            assert set(json.loads(schema.data)["required"]) == set(json.loads(schema.data)["properties"])
+            fields, required = (set(json.loads(schema.data)[key]) for key in ("properties", "required"))
+            assert required == fields or topic.name in ("/cues", "/simulated/fixes")
     assert summary.statistics.message_count == len(TOPICS)
     assert summary.statistics.channel_count == len(TOPICS)
 
@@ -385,3 +386,16 @@ def test_a_pipe_is_rejected_without_waiting(tmp_path: Path):
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(LinkError, match="is no regular file"):
         RecordingReader(tmp_path / "pipe")
+
+
+def test_the_topics_of_a_second_drone_are_declared_as_those_of_the_first(tmp_path: Path):
+    records = [Record(name, T0, T0, b"{}") for name in ("/truth/drone_2", "/truth/hits_3", "/truth/drone_", "/mine_2")]
+    write(tmp_path / "a.mcap", records)
+    with (tmp_path / "a.mcap").open("rb") as stream:
+        found = [(schema and schema.name, channel.message_encoding) for schema, channel, _ in _messages(stream)]
+    raw = (None, "application/octet-stream")
+    assert found == [("grd.Pose", "json"), ("grd.Hits", "json"), raw, raw]
+
+
+def _messages(stream):
+    return list(mcap.reader.make_reader(stream).iter_messages(log_time_order=False))

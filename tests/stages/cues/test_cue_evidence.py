@@ -81,8 +81,8 @@ def test_each_cue_and_their_sum_are_capped():
 
 
 def test_a_cue_elsewhere_costs_at_most_the_log_of_its_outlier_probability():
-    assert nats_of(gnss(PLACE_M + [30.0, 0.0, 0.0])) == pytest.approx(math.log(0.1), abs=1e-3)
-    assert nats_of(gnss(PLACE_M + [3000.0, 0.0, 0.0])) == pytest.approx(math.log(0.1))
+    assert nats_of(gnss(PLACE_M + np.array([30.0, 0.0, 0.0]))) == pytest.approx(math.log(0.1), abs=1e-3)
+    assert nats_of(gnss(PLACE_M + np.array([3000.0, 0.0, 0.0]))) == pytest.approx(math.log(0.1))
 
 
 def test_a_cue_that_contradicts_removes_what_the_others_add():
@@ -102,7 +102,9 @@ def test_old_cues_are_no_evidence():
 
 
 def test_a_cue_is_compared_with_the_object_at_the_time_of_its_measurement():
-    flying = ObjectState(START_NS + 200_000_000, PLACE_M + [2.0, 0.0, 0.0], np.array([10.0, 0.0, 0.0]), (0.01, 0, 0.01))
+    flying = ObjectState(
+        START_NS + 200_000_000, PLACE_M + np.array([2.0, 0.0, 0.0]), np.array([10.0, 0.0, 0.0]), (0.01, 0, 0.01)
+    )
     evidence = CueEvidence(CueWeights(), SEARCH_M)
     evidence.add(gnss(bias_m=0.1), TRAIL, [])
     assert evidence.nats(flying, TRAIL, flying.stamp_ns)[0] == 3.0
@@ -123,7 +125,7 @@ def test_the_bias_is_estimated_and_corrects_the_position():
 
 def test_a_cue_30_m_off_is_reported_and_not_used():
     evidence = CueEvidence(CueWeights(), SEARCH_M)
-    wrong_m = PLACE_M + [21.0, -21.0, 0.0]
+    wrong_m = PLACE_M + np.array([21.0, -21.0, 0.0])
     for k in range(CONTRADICTIONS):
         state = evidence.add(gnss(wrong_m, 0.2 * k), TRAIL, [thing(t_s=0.2 * k)])
     assert not state.trusted
@@ -160,6 +162,6 @@ def test_without_the_lidar_a_bias_is_forgotten_slowly():
 def test_a_cue_of_another_kind_starts_a_new_bias_but_stays_distrusted():
     evidence = CueEvidence(CueWeights(), SEARCH_M)
     for k in range(CONTRADICTIONS):
-        evidence.add(gnss(PLACE_M + [30.0, 0, 0], 0.2 * k), TRAIL, [thing(t_s=0.2 * k)])
+        evidence.add(gnss(PLACE_M + np.array([30.0, 0, 0]), 0.2 * k), TRAIL, [thing(t_s=0.2 * k)])
     level = cue("gnss", CueKind.LEVEL_AND_HEIGHT, [13.0, 9.0], 0.3, 3.5, 1.0)
     assert not evidence.add(level, TRAIL, []).trusted

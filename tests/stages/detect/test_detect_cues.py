@@ -63,9 +63,7 @@ def test_the_first_observations_alone_are_never_accepted_by_a_cue():
     """Nor is a single observation away from the cue dropped: it stays promising."""
     for off_m in ((0.0, 0.0, 0.0), OFF_M):
         candidates, _ = run([Drone(MOVING)], seconds=0.6, publish=Receiver(MOVING, off_m))
-        few = [
-            (p, n) for c in candidates for p, n in zip(c.probability.tolist(), c.scan_passes.tolist(), strict=True)
-        ]
+        few = [(p, n) for c in candidates for p, n in zip(c.probability.tolist(), c.scan_passes.tolist(), strict=True)]
         assert any(n == 1 for _, n in few)
         assert all(p < 0.95 for p, n in few if n < 3)
         assert all(p >= 0.0139 for p, n in few if n == 1)

@@ -58,7 +58,12 @@ def imu(stamp_ns: int) -> DroneImu:
 
 def global_position(independent: bool) -> DroneGlobalPosition:
     return DroneGlobalPosition(
-        stamp_ns=5, latitude_rad=0.6, longitude_rad=2.4, altitude_m=9.0, altitude_above_home_m=5.0, independent=independent
+        stamp_ns=5,
+        latitude_rad=0.6,
+        longitude_rad=2.4,
+        altitude_m=9.0,
+        altitude_above_home_m=5.0,
+        independent=independent,
     )
 
 

@@ -27,9 +27,7 @@ PERFECT_RANGING = {"noise_m": 0.0, "bias_m": 0.0, "reflected_share": 0.0}
 
 def messages_of(cues: dict, seconds: float = 3.0):
     """(simulation, messages) of a flight, as grd's links decode them."""
-    scenario = load_scenario(SCENARIO).changed(
-        cues=cues, duration_s=seconds, vehicle_odometry=None
-    )
+    scenario = load_scenario(SCENARIO).changed(cues=cues, duration_s=seconds, vehicle_odometry=None)
     simulation = Simulation(scenario)
     autopilot, link, found = Autopilot(), Cues(), []
     for source in simulation.telemetry_sources:

@@ -308,7 +308,8 @@ class BeamAim(Stage[BeamAimSettings]):
             low_rad, high_rad = state.sector.limits(servo.stamp_ns, state.sweep.passes)
             state.sweep.limit(low_rad, high_rad)
             nearest_rad = min(max(servo.position_rad, low_rad), high_rad)
-            if abs(servo.position_rad - nearest_rad) > OUTSIDE_RAD:
+            is_sector = (low_rad, high_rad) != self._travel_rad
+            if is_sector and abs(servo.position_rad - nearest_rad) > OUTSIDE_RAD:
                 if state.approach_rad == nearest_rad:
                     return None
                 state.approach_rad = nearest_rad

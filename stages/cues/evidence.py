@@ -5,7 +5,7 @@
 z: measurement, h(x): the same of the candidate's position x at that time, b and S: bias and covariance of the cue and
 of the candidate, p_0: density of z for an object anywhere within the search range, e: probability that a
 cue is of another object. Of the newest three measurements of a cue the median counts: a single reflection changes
-nothing. The caps are the safety: with the largest sum a candidate must reach even odds by the LiDAR alone. A cue that
+nothing. The caps are the safety: with the largest sum a candidate must reach 72 % by the LiDAR alone. A cue that
 contradicts the candidate removes what the others add.
 
 A cue that contradicts the drone found by the LiDAR alone is not used and is reported (`bias.py`).
@@ -40,10 +40,10 @@ class CueWeights(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     outlier_probability: float = Field(0.1, gt=0, lt=0.5)  # that a cue is of another object
-    max_gnss: float = Field(3.0, ge=0, le=6)
+    max_gnss: float = Field(2.0, ge=0, le=6)
     max_uwb: float = Field(2.0, ge=0, le=6)
     max_altitude: float = Field(1.0, ge=0, le=6)  # objects are not uniform over height
-    max_sum: float = Field(3.0, ge=0, le=6)
+    max_sum: float = Field(2.0, ge=0, le=6)
     recovery_nats_per_s: float = Field(1.0, gt=0)  # how fast a candidate recovers from a contradiction
 
     def cap(self, source: str) -> float:

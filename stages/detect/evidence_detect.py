@@ -297,10 +297,15 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
         return c.was_promising or before != c.is_promising
 
     def _add_cues(self, now: _State, c: Candidate) -> None:
-        """Add the evidence of cues to the log-odds: their lowest of the last seconds, so that a short match is none."""
+        """Add the evidence of cues to the log-odds: their lowest of the last seconds, so that a short match is none.
+
+        A cue is of one object: it adds nothing to others while it matches an accepted candidate.
+        """
         nats, remark = now.cues.nats(_object(c), now.trail, c.stamp_ns)
         if not remark and c.cue_nats is None:
             return
+        if nats > 0.0 and any(o is not c and o.accepted and (o.cue_nats or 0.0) > 0.0 for o in now.table):
+            nats = 0.0
         if remark and c.cue_nats is not None:
             since_s = (c.stamp_ns - c.cue_ns) * 1e-9
             nats = min(nats, c.cue_nats + self.settings.cues.recovery_nats_per_s * since_s)

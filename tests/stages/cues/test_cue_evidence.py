@@ -73,10 +73,10 @@ def test_the_log_ratio_is_that_of_the_mixture():
 
 def test_each_cue_and_their_sum_are_capped():
     range_m = float(np.linalg.norm(PLACE_M))
-    assert nats_of(gnss()) == 3.0
+    assert nats_of(gnss()) == 2.0
     assert nats_of(uwb(range_m)) == 2.0
     assert nats_of(altitude(9.0)) == 1.0
-    assert nats_of(gnss(), uwb(range_m), altitude(9.0)) == 3.0
+    assert nats_of(gnss(), uwb(range_m), altitude(9.0)) == 2.0
     assert nats_of(gnss(), weights=CueWeights(max_gnss=0.0)) == 0.0
 
 
@@ -97,7 +97,7 @@ def test_one_reflection_of_a_ranging_radio_changes_nothing():
 
 
 def test_old_cues_are_no_evidence():
-    assert nats_of(gnss(), t_s=1.4) == 3.0
+    assert nats_of(gnss(), t_s=1.4) == 2.0
     assert nats_of(gnss(), t_s=1.6) == 0.0
 
 
@@ -107,7 +107,7 @@ def test_a_cue_is_compared_with_the_object_at_the_time_of_its_measurement():
     )
     evidence = CueEvidence(CueWeights(), SEARCH_M)
     evidence.add(gnss(bias_m=0.1), TRAIL, [])
-    assert evidence.nats(flying, TRAIL, flying.stamp_ns)[0] == 3.0
+    assert evidence.nats(flying, TRAIL, flying.stamp_ns)[0] == 2.0
     still = flying._replace(velocity_mps=np.zeros(3))
     assert evidence.nats(still, TRAIL, flying.stamp_ns)[0] < 0.0
 

@@ -10,7 +10,8 @@ import pytest
 from stages.detect import EvidenceDetect
 from stages.messages import CueKind, CueState, DroneCue
 from tests.stages.caster import Ball, Drone, still
-from tests.stages.detect.test_evidence_detect import MOVING, PLACE_M, accepted_after_s, reasons_of, run
+from tests.stages.detect.test_candidate import candidate
+from tests.stages.detect.test_evidence_detect import MOVING, PLACE_M, accepted_after_s, observation, reasons_of, run
 from tests.stages.made import START_NS
 
 OFF_M = np.array([20.0, 0.0, 22.0])  # 30 m
@@ -47,7 +48,7 @@ def test_a_true_cue_speeds_acceptance(seed):
     _, without = run([Drone(MOVING, seed=seed)])
     candidates, with_cue = run([Drone(MOVING, seed=seed)], publish=Receiver(MOVING, (2.0, -2.0, 1.0)))
     assert accepted_after_s(with_cue) < accepted_after_s(without) - 0.1
-    assert "cues +3.0 (gnss +3.0)" in reasons_of(candidates)
+    assert "cues +2.0 (gnss +2.0)" in reasons_of(candidates)
 
 
 def test_a_cue_30_m_off_delays_the_drone_by_about_a_second_and_is_reported():
@@ -73,6 +74,22 @@ def test_a_balloon_exactly_at_a_lying_cue_is_not_accepted():
     place = still(*PLACE_M)
     _, detections = run([Ball(place, 0.25)], seconds=4.0, publish=Receiver(place))
     assert accepted_after_s(detections) == math.inf
+
+
+def test_a_cue_that_matches_an_accepted_candidate_adds_nothing_to_another_one():
+    stage = EvidenceDetect(parked=True)
+    now = stage._now
+    drone, other = (candidate(observation(0.0, np.array(PLACE_M) + k)) for k in (0.0, 2.0))
+    other.number = drone.number + 1
+    for c in (drone, other):
+        c.scan_passes = 3
+        now.table.put(c)
+    stage.on_cue(gnss(0.2, PLACE_M))
+    stage._add_cues(now, other)
+    assert other.cue_nats == pytest.approx(2.0)
+    drone.accepted, drone.cue_nats, other.cue_nats = True, 2.0, None
+    stage._add_cues(now, other)
+    assert other.cue_nats == 0.0
 
 
 def test_after_the_drone_is_known_the_cues_bias_is():

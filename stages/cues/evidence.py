@@ -39,12 +39,12 @@ class CueWeights(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    outlier_probability: float = Field(0.1, gt=0, lt=0.5)  # that a cue is of another object
-    max_gnss: float = Field(2.0, ge=0, le=6)
-    max_uwb: float = Field(2.0, ge=0, le=6)
-    max_altitude: float = Field(1.0, ge=0, le=6)  # objects are not uniform over height
-    max_sum: float = Field(2.0, ge=0, le=6)
-    recovery_nats_per_s: float = Field(1.0, gt=0)  # how fast a candidate recovers from a contradiction
+    outlier_probability: float = Field(default=0.1, gt=0, lt=0.5)  # that a cue is of another object
+    max_gnss: float = Field(default=2.0, ge=0, le=6)
+    max_uwb: float = Field(default=2.0, ge=0, le=6)
+    max_altitude: float = Field(default=1.0, ge=0, le=6)  # objects are not uniform over height
+    max_sum: float = Field(default=2.0, ge=0, le=6)
+    recovery_nats_per_s: float = Field(default=1.0, gt=0)  # how fast a candidate recovers from a contradiction
 
     def cap(self, source: str) -> float:
         """Cap of one cue."""

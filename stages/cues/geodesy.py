@@ -47,11 +47,9 @@ def displacement_enu_m(origin: Geographic, to: Geographic) -> Array64:
 
 def moved(origin: Geographic, enu_m: Array64) -> Geographic:
     """The position some metres (3,) east, north, up of another one: the inverse of `displacement_enu_m`, to 1 mm."""
-    latitude_rad = origin.latitude_rad
+    h, mean_rad = origin.altitude_m + float(enu_m[2]) / 2, origin.latitude_rad
     for _ in range(3):
-        M, N = radii_m((origin.latitude_rad + latitude_rad) / 2)
-        latitude_rad = origin.latitude_rad + float(enu_m[1]) / (M + origin.altitude_m + float(enu_m[2]) / 2)
-    mean_rad = (origin.latitude_rad + latitude_rad) / 2
-    h = origin.altitude_m + float(enu_m[2]) / 2
+        mean_rad = origin.latitude_rad + float(enu_m[1]) / (radii_m(mean_rad)[0] + h) / 2
+    latitude_rad, N = 2 * mean_rad - origin.latitude_rad, radii_m(mean_rad)[1]
     longitude_rad = origin.longitude_rad + float(enu_m[0]) / ((N + h) * math.cos(mean_rad))
     return Geographic(latitude_rad, longitude_rad, origin.altitude_m + float(enu_m[2]))

@@ -45,31 +45,33 @@ class _CueSettings(BaseModel):
 class GnssSettings(_CueSettings):
     """Errors of one GNSS receiver, one sigma an axis, and the antenna on the vehicle."""
 
-    latency_s: float = Field(0.2, ge=0, le=2)
-    noise_m: float = Field(0.3, gt=0)
-    noise_up_m: float = Field(0.6, gt=0)
-    bias_m: float = Field(2.5, ge=0)
-    bias_up_m: float = Field(4.0, ge=0)
+    latency_s: float = Field(default=0.2, ge=0, le=2)
+    noise_m: float = Field(default=0.3, gt=0)
+    noise_up_m: float = Field(default=0.6, gt=0)
+    bias_m: float = Field(default=2.5, ge=0)
+    bias_up_m: float = Field(default=4.0, ge=0)
     antenna_vehicle_m: Vector3 = (0.0, 0.0, 0.0)  # position on the vehicle
-    heading_sigma_deg: float = Field(3.0, gt=0, le=45)  # of a heading that comes without its own
+    heading_sigma_deg: float = Field(default=3.0, gt=0, le=45)  # of a heading that comes without its own
 
 
 class UwbSettings(_CueSettings):
     """Errors of the ranging, one sigma, and the device on the vehicle. Decawave DW1000: 0.1 m in line of sight."""
 
-    latency_s: float = Field(0.02, ge=0, le=2)
-    noise_m: float = Field(0.1, gt=0)
-    bias_m: float = Field(0.3, ge=0)  # antenna delays, and the device's position on the drone
+    latency_s: float = Field(default=0.02, ge=0, le=2)
+    noise_m: float = Field(default=0.1, gt=0)
+    bias_m: float = Field(default=0.3, ge=0)  # antenna delays, and the device's position on the drone
     anchor_vehicle_m: Vector3 = (0.0, 0.0, 0.0)  # position on the vehicle
 
 
 class AltitudeSettings(_CueSettings):
     """Errors of the barometric altitude, one sigma, and the height of the take-off point."""
 
-    latency_s: float = Field(0.1, ge=0, le=2)
-    noise_m: float = Field(0.3, gt=0)
-    bias_m: float = Field(1.5, ge=0)  # 0.18 hPa of weather, temperature and rotor wash since the take-off
-    home_up_m: float | None = Field(None, ge=-100, le=100)  # above the vehicle's origin at its start; None: not used
+    latency_s: float = Field(default=0.1, ge=0, le=2)
+    noise_m: float = Field(default=0.3, gt=0)
+    bias_m: float = Field(default=1.5, ge=0)  # 0.18 hPa of weather, temperature and rotor wash since the take-off
+    home_up_m: float | None = Field(
+        default=None, ge=-100, le=100
+    )  # above the vehicle's origin at its start; None: not used
 
 
 class RelativeCuesSettings(Settings):

@@ -229,9 +229,12 @@ def main() -> None:
     rows = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()] if file.exists() else []
     made = {(row["cell"], row["seed"], row["variant"]) for row in rows}
     seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
+    selected = cells(arguments.only or ["*"])
     flights = [
         Flight(cell, seed, variant)
-        for cell, seed, variant in itertools.product(cells(arguments.only or ["*"]), seeds, arguments.variants)
+        for cell in selected
+        for seed in seeds
+        for variant in arguments.variants
         if ("another" not in variant or cell.motion == "two") and (cell.name, seed, variant) not in made
     ]
     for first in range(0, len(flights), arguments.jobs):

@@ -25,7 +25,7 @@ MARGIN_M = 1.0  # motion of the drone between two measurements
 STEP_RAD = math.radians(1.0)
 LEAST_RAD = math.radians(8.0)  # width of a sector: four spacings of a VLP-16's beams
 MOST_SHARE = 0.7  # of the travel: a wider sector is the whole travel
-SECTOR_PASSES, WHOLE_PASSES = 4, 2
+SECTOR_PASSES, WHOLE_PASSES = 2, 2
 OLDEST_NS = 1_500_000_000
 CHANGED_RAD = math.radians(6.0)  # the sweep keeps its limits until they differ by more
 

@@ -39,7 +39,7 @@ class CueWeights(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    outlier_probability: float = Field(default=0.1, gt=0, lt=0.5)  # that a cue is of another object
+    outlier_probability: float = Field(default=0.3, gt=0, lt=0.5)  # that a cue is of another object
     max_gnss: float = Field(default=2.0, ge=0, le=6)
     max_uwb: float = Field(default=2.0, ge=0, le=6)
     max_altitude: float = Field(default=1.0, ge=0, le=6)  # objects are not uniform over height

@@ -36,6 +36,7 @@ ARMED = 128  # MAV_MODE_FLAG_SAFETY_ARMED
 CRITICAL = 5  # MAV_STATE_CRITICAL; above: emergency, poweroff, termination
 FOREIGN_TIMESYNC = "TIMESYNC for another component"  # reason in `rejected`
 ESTIMATES = (DroneAttitude, DroneLocalPosition, DroneOdometry, DroneGlobalPosition)
+ARRIVAL_STAMPED = "GPS_RAW_INT"  # its time is that of the last fix, long ago without one, or since 1970: no clock
 LATE = 128  # a sequence number this far ahead is a late frame, not 128 lost frames
 
 
@@ -111,6 +112,8 @@ class FrameDecoder:
     def _stamp(self, frame: Any, arrival_ns: int) -> int | None:
         """Time of the measurement on the host's timeline; None while the device's clock is inconsistent."""
         in_ms, kind = hasattr(frame, "time_boot_ms"), frame.get_type()
+        if kind == ARRIVAL_STAMPED:
+            return arrival_ns
         device_ns = frame.time_boot_ms * 1_000_000 if in_ms else self._device_ns(kind, frame.time_usec, arrival_ns)
         stamp_ns = self.clock.read(device_ns, arrival_ns)
         if stamp_ns is None:

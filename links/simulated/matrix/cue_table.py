@@ -25,12 +25,12 @@ from typing import Any
 
 import numpy as np
 
+from flow.jobs import Workers, run_all
 from flow.link import LinkError, Tap
 from flow.message import Message
 from links.runs.request import RunRequest
 from links.runs.shipped import shipped
 from links.simulated.matrix.flights import CAMERA_HEIGHT_M, Cell
-from links.simulated.matrix.jobs import run_all
 from links.simulated.matrix.matrix import Conditions, cells, scenario_of
 from links.simulated.rig.closed_loop import ClosedLoop
 from links.simulated.rig.run import Simulation
@@ -237,8 +237,9 @@ def main() -> None:
         for variant in arguments.variants
         if ("another" not in variant or cell.motion == "two") and (cell.name, seed, variant) not in made
     ]
+    workers: Workers = arguments.jobs
     for first in range(0, len(flights), arguments.jobs):
-        for row in run_all(fly, flights[first : first + arguments.jobs], arguments.jobs, lambda _: None):
+        for row in run_all(fly, flights[first : first + arguments.jobs], workers, lambda _: None):
             if row is not None:
                 rows.append(row)
                 with file.open("a", encoding="utf-8") as stream:

@@ -64,7 +64,7 @@ def odometry(
     )
 
 
-def test_the_outputs_are_the_six_messages_of_an_autopilot_and_the_state_of_an_earlier_run():
+def test_the_outputs_are_the_messages_of_an_autopilot_its_cues_and_the_state_of_an_earlier_run():
     assert set(output_ports(Autopilot)) == {
         "drone_attitude",
         "drone_local_position",
@@ -73,6 +73,9 @@ def test_the_outputs_are_the_six_messages_of_an_autopilot_and_the_state_of_an_ea
         "autopilot_status",
         "autopilot_estimator",
         "earlier_odom_frame",
+        "drone_gnss",
+        "drone_global_position",
+        "uwb_range",
     }
 
 

@@ -78,3 +78,16 @@ def test_only_a_distance_of_a_ranging_radio_is_a_range():
     for k, bad in enumerate((distance(1400, cm=5), distance(1500, cm=20_000))):
         assert autopilot.decode(record(sender.frame(bad), 400.0 + 100 * k)) is None
     assert autopilot.counters.rejected == {"distance out of the sensor's range": 2}
+
+
+def test_the_time_of_a_receiver_without_a_fix_since_long_does_not_set_the_autopilots_clock():
+    sender, autopilot = Sender(), Autopilot()
+    for k in range(8):
+        autopilot.decode(record(sender.attitude(100_000 + 100 * k), 100.0 * k))
+    offset_ns = autopilot._decoder.clock.offset_ns
+    for k in range(8):
+        gnss = autopilot.decode(record(sender.frame(gps(0)), 900.0 + 100 * k))
+        assert isinstance(gnss, DroneGnss)
+        assert gnss.stamp_ns == HOST0 + round((900.0 + 100 * k) * MS)
+    assert autopilot._decoder.clock.offset_ns == offset_ns
+    assert autopilot.counters["clock restarts"] == 0

@@ -49,19 +49,19 @@ def fix_errors(flown: RecordedFlight) -> tuple[float, float, list[float]] | None
     white, mean = np.array([m.covariance_m2 for m in fixes]) - bias, error.mean(axis=0)
     off, t = error - mean, np.array([m.stamp_ns for m in fixes]) * 1e-9
     varying = float(np.mean([e @ np.linalg.solve(C, e) for e, C in zip(off, white, strict=True)])) / 3
-    lasting = float(mean @ np.linalg.solve(bias.mean(axis=0), mean)) / 3
+    constant = float(mean @ np.linalg.solve(bias.mean(axis=0), mean)) / 3
     apart_s, products = t[None, :] - t[:, None], off @ off.T
     power = float(np.mean(np.sum(off**2, axis=1)))
-    return varying, lasting, [float(np.mean(products[np.abs(apart_s - lag) < 0.03])) / power for lag in LAGS_S]
+    return varying, constant, [float(np.mean(products[np.abs(apart_s - lag) < 0.03])) / power for lag in LAGS_S]
 
 
 def test_errors_of_lidar_positions():
     found = [one for name in FLIGHTS if (one := fix_errors(flight(name, "fuse"))) is not None]
     assert found
-    varying, lasting = np.mean([one[0] for one in found]), np.mean([one[1] for one in found])
+    varying, bias = np.mean([one[0] for one in found]), np.mean([one[1] for one in found])
     correlation = np.mean([one[2] for one in found], axis=0)
     at = ", ".join(f"{value:.2f} at {lag:g} s" for value, lag in zip(correlation, LAGS_S, strict=True))
-    print(f"\n{len(found)} flights: variance {varying:.2f} of the reported, bias {lasting:.2f}; correlation {at}")  # noqa: T201
+    print(f"\n{len(found)} flights: variance {varying:.2f} of the reported, bias {bias:.2f}; correlation {at}")  # noqa: T201
     assert 0.2 < varying < 2.0
 
 

@@ -211,7 +211,7 @@ def test_one_row_for_each_configuration_is_the_table_of_ablations(two_configs):
             ["track.use_pass_throughs=false", "viewer.file=null"],
             "estimate track.use_pass_throughs=false",
         ),
-        ("flight-1-without_misses", ["track.use_pass_throughs=false"], "without_misses"),
+        ("flight-1-no_pass_throughs", ["track.use_pass_throughs=false"], "no_pass_throughs"),
         ("anything", ["track.use_pass_throughs=false"], "estimate track.use_pass_throughs=false"),
     ],
 )

@@ -70,7 +70,7 @@ def test_a_parked_vehicle_with_noise_and_a_tight_bend_are_not_detected():
 
 
 def test_a_slow_vehicle_may_stop_at_once():
-    """Physics cannot tell: it brakes within the tolerance."""
+    """It is not detectable: it brakes within the tolerance."""
     assert detected_s(straight(1.0, 5.0)) is None
 
 

@@ -112,7 +112,7 @@ def test_two_gross_errors_in_succession_contradict_and_a_single_one_does_not():
     assert contradicted(made([-5.0, -5.0], period_s=1.0)) == (None, False), "too far apart"
 
 
-def test_a_lasting_small_error_contradicts_and_an_ordinary_scale_error_does_not():
+def test_a_small_error_of_constant_size_contradicts_and_an_ordinary_scale_error_does_not():
     rng = np.random.default_rng(1)
     at, state = contradicted(made(list(0.4 + 0.1 * rng.standard_normal(40))))
     assert at is not None

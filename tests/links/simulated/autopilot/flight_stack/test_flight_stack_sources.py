@@ -51,7 +51,7 @@ def test_px4_takes_positions_without_rotation_only_with_a_compass(sets: list[str
 
 
 def test_a_wrong_position_moves_the_drone_the_other_way() -> None:
-    """The drone holds where it is told it is: told 1 m too far forward from 8 s on, it goes back by 1 m."""
+    """A position that is 1 m too far forward from 8 s on moves the drone back by 1 m."""
     host = Host(20.0)
 
     def shift(message, time_s: float) -> None:

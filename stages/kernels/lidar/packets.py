@@ -47,7 +47,7 @@ COS_ELEVATION, SIN_ELEVATION, Z_OFFSET_M, AZIMUTH_OFFSET_RAD, TURN_NS, DELAY_NS,
 """Columns of a pulse: TURN_NS is the time by which the rotor has turned on since the block's azimuth was read."""
 
 
-class Rows(NamedTuple):
+class Firings(NamedTuple):
     """Columns of a LidarFirings message: one row per pulse and return."""
 
     pulse_stamp_ns: Integers

@@ -11,11 +11,11 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import dataclass, field
-from itertools import pairwise
 
 import numpy as np
 
 from flow.link import Record
+from links.simulated.autopilot.flight_stack.events import EventKind
 from links.simulated.autopilot.flight_stack.sent_poses import SentPoses
 from links.simulated.autopilot.flight_stack.stack import FlightStack
 from links.simulated.kernels.motion import STEP_S
@@ -102,14 +102,14 @@ class FlightOutcome:
         if self._lost_s is None and (self._stack.quadrotor.crashed or self._stack.target_error_m > FLYAWAY_M):
             self._lost_s = self._stack.motion.until_s
         wait_s = self._stack.settings.end_after_loss_s
-        failed_s = next((t for t, what in self._stack.events if what == "EKF failsafe"), math.inf)
+        failsafe_s = self._failsafe_s()
+        failed_s = math.inf if failsafe_s is None else failsafe_s
         first_s = min(failed_s, math.inf if self._lost_s is None else self._lost_s)
         return wait_s is not None and self._stack.motion.until_s > first_s + wait_s
 
     def result(self, heading_s: float | None = None) -> Outcome:
         """The outcome so far; heading_s: see Outcome."""
-        events = self._stack.events
-        failsafe = next((time_s for time_s, what in events if what == "EKF failsafe"), None)
+        failsafe = self._failsafe_s()
         lost_s = min([t for t in (self._lost_s, failsafe) if t is not None], default=None)
         end_s = self._stack.motion.until_s if lost_s is None else lost_s
         until_ns = self._truth.start_ns + round(self._stack.motion.until_s * 1e9)
@@ -132,20 +132,25 @@ class FlightOutcome:
             longest_gap_s=self._poses.longest_gap_s(self._truth.start_ns + round(end_s * 1e9)),
             hover_scatter_m=self._hover_scatter(),
             estimate_worst_m=round(self._stack.worst_target_error_m, 2),
-            events=list(events),
+            events=[(event.time_s, str(event)) for event in self._stack.events],
         )
+
+    def _failsafe_s(self) -> float | None:
+        """Time of the first EKF failsafe."""
+        return next((e.time_s for e in self._stack.events if e.kind is EventKind.EKF_FAILSAFE), None)
 
     def _hover_scatter(self) -> float | None:
         """Worst 3D RMS of the position about its mean, over the holds after the switch."""
         states = self._stack.motion.states
         worst: float | None = None
         external = False
-        events = [*self._stack.events, (self._stack.motion.until_s, "end")]
-        for (begin_s, what), (end_s, _) in pairwise(events):
-            external |= what.startswith("source set") and self._stack.external_sets[int(what.split()[-1]) - 1]
-            if what != "plan: hold" or not external or end_s - begin_s < 2 * SETTLE_S:
+        events = self._stack.events
+        ends_s = [*(event.time_s for event in events[1:]), self._stack.motion.until_s][: len(events)]
+        for event, end_s in zip(events, ends_s, strict=True):
+            external |= event.kind is EventKind.SOURCE_SET and self._stack.external_sets[event.number - 1]
+            if not event.holds or not external or end_s - event.time_s < 2 * SETTLE_S:
                 continue
-            held = states[round((begin_s + SETTLE_S) / STEP_S) : round(end_s / STEP_S), 0:3]
+            held = states[round((event.time_s + SETTLE_S) / STEP_S) : round(end_s / STEP_S), 0:3]
             scatter = float(np.sqrt(((held - held.mean(axis=0)) ** 2).sum(axis=1).mean()))
             worst = scatter if worst is None else max(worst, scatter)
         return None if worst is None else round(worst, 3)

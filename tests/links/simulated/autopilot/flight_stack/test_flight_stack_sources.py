@@ -92,7 +92,7 @@ def test_without_poses_it_lands_after_the_timeout_and_one_second(kind: str, afte
     host = Host(22.0, kind=kind)
     host.sends = lambda time_s: 1.0 < time_s < 8.0
     host.run(22.0)
-    failsafe_s = next(time_s for time_s, what in host.stack.events if what == "EKF failsafe")
+    failsafe_s = next(event.time_s for event in host.stack.events if str(event) == "EKF failsafe")
     assert failsafe_s == pytest.approx(8.0 + after_s, abs=0.5)
     assert host.stack.quadrotor.state[2] < 6.0
     assert host.received("HEARTBEAT")[-1].custom_mode == 9

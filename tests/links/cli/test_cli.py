@@ -18,7 +18,7 @@ from flow.subprocess_replay import can_use_subprocesses
 from links.cli.app import COMMANDS
 from links.cli.app import command as command_named
 from links.cli.files import read_rig
-from tests.links import command
+from tests import command
 
 ROOT = Path(__file__).resolve().parents[3]
 STREET = ROOT / "recordings" / "street_sweep.mcap"

@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from flow.graph import load_graph
-from tests.links import command
+from tests import command
 from tests.stages.geometry.test_lens import KANNALA_BRANDT, OCAM
 from tests.stages.geometry.test_lens_files import KALIBR, OCAMCALIB
 from tests.test_architecture import ROOT

@@ -22,7 +22,7 @@ from links.evaluation.groups import (
 )
 from links.evaluation.run_data import OutputKind, read_run
 from links.evaluation.tables import median_columns, medians, runs_table
-from tests.links.command import grd
+from tests.command import grd
 from tests.links.evaluation.made_runs import add_pose, all_evaluated, evaluated, make_run, truth_at, yaw_quaternion
 
 T_S = np.arange(0.0, 10.0, 0.1)

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import importlib
+import inspect
+import pkgutil
 import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 from numba.core import config
+from numba.core.registry import CPUDispatcher
 
+import links.simulated.kernels
+import stages.kernels
 from flow.compile_cache import cache_folder, cache_name
+from stages.kernels import compiled
 from stages.kernels.compiled import CACHE_FOLDER, COMPILED
 
 REPOSITORY = Path(__file__).resolve().parents[3]
@@ -30,6 +38,17 @@ def test_every_compiled_function_is_in_a_folder_of_the_name():
     users = [path for path in users if "import compiled" in path.read_text(encoding="utf-8")]
     assert len(users) > 20
     assert [path for path in users if not any(REPOSITORY / folder in path.parents for folder in COMPILED)] == []
+
+
+@pytest.mark.parametrize("kernels", [links.simulated.kernels, stages.kernels])
+def test_kernels_define_compiled_functions_only(kernels):
+    for module in pkgutil.walk_packages(kernels.__path__, f"{kernels.__name__}."):
+        loaded = importlib.import_module(module.name)
+        own = [value for value in vars(loaded).values() if getattr(value, "__module__", None) == module.name]
+        assert own or module.ispkg, module.name
+        functions = [value for value in own if callable(value) and not inspect.isclass(value)]
+        if loaded is not compiled:  # the decorators themselves
+            assert all(isinstance(value, CPUDispatcher) for value in functions), module.name
 
 
 def test_numba_uses_it_and_a_folder_that_cannot_be_created_is_no_error(tmp_path, monkeypatch):

@@ -11,7 +11,7 @@ from flow.message import check_arrays
 from stages.geometry.frames import rotation_z
 from stages.messages import DroneMotion
 from stages.odometry.drone import InertialMotion
-from tests.stages.odometry.made_imu import (
+from tests.stages.odometry.drone.made_imu import (
     R_odom_drone,
     attitude,
     imu,

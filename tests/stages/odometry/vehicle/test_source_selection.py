@@ -16,7 +16,7 @@ from stages.geometry.frames import rotation_z, transform
 from stages.geometry.trajectory import VehicleTrajectory
 from stages.messages import MotionStatus, VehicleMotion
 from stages.odometry.vehicle import VehicleMotionSelector
-from tests.stages.odometry.test_static_scan import WALLS, slices
+from tests.stages.odometry.vehicle.test_static_scan import WALLS, slices
 
 S = 1_000_000_000
 

@@ -1,6 +1,6 @@
 """CPU time of replays without cameras: slices of 10 ms side by side with one message per LiDAR packet.
 
-    python -m pytest tests/benchmarks/bench_replay.py -s
+    python -m pytest tests/benchmarks/system/bench_replay.py -s
 
 The figures are recorded seconds per second of process time, in one thread, alternating, median of ROUNDS; the ratio is
 that of the medians. Reading the file is not included.
@@ -21,7 +21,7 @@ from flow.taps import Digest
 from links.recording import RecordingReader
 from links.runs.request import RunRequest
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 ROUNDS = 5
 KINDS = {"slices": (), "packets": ("lidar.slice_ms=0.1",)}
 

@@ -7,7 +7,7 @@ import pytest
 
 from stages.odometry.drone import InertialMotion
 from stages.odometry.drone.imu_outliers import FalseSamples
-from tests.stages.odometry.made_imu import imu
+from tests.stages.odometry.drone.made_imu import imu
 
 LIFT = np.array([0.0, 0.0, 9.81])
 

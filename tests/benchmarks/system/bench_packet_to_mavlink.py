@@ -1,7 +1,7 @@
 """How much later than the LiDAR packet that let it out a pose leaves for the autopilot.
 
-    python -m pytest tests/benchmarks/bench_packet_to_mavlink.py -s
-    GRD_FLIGHT=out/live/flight.mcap python -m pytest tests/benchmarks/bench_packet_to_mavlink.py -s
+    python -m pytest tests/benchmarks/system/bench_packet_to_mavlink.py -s
+    GRD_FLIGHT=out/live/flight.mcap python -m pytest tests/benchmarks/system/bench_packet_to_mavlink.py -s
 
 The first flies a simulated drone in closed loop through the whole graph, on one thread: it times each record, from when
 it is fed until it is taken in, or until the datagram of the pose that it lets out is read at a peer's socket: a LiDAR
@@ -34,10 +34,10 @@ from links.simulated.matrix.matrix import Conditions, scenario_of
 from links.simulated.rig.run import simulate_records
 from stages.messages import RelativePose
 
-sys.path.append(str(Path(__file__).parents[1] / "links" / "mavlink"))
+sys.path.append(str(Path(__file__).parents[2] / "links" / "mavlink"))
 from tests.links.mavlink.mavlink_poses import good_pose
 
-CONFIG = Path(__file__).resolve().parents[2] / "configs" / "estimate.yaml"
+CONFIG = Path(__file__).resolve().parents[3] / "configs" / "estimate.yaml"
 ODOMETRY = 331
 FLIGHT = os.environ.get("GRD_FLIGHT")
 

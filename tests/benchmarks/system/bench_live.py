@@ -1,6 +1,6 @@
 """The live runner at the pace of the sensors: CPU, and the delay of each edge, compared with a replay of the same records.
 
-    pytest tests/benchmarks/bench_live.py -s
+    pytest tests/benchmarks/system/bench_live.py -s
 
 Thirteen seconds of LiDAR (754 packets a second), servo and autopilot go through the field's stages; four stages in one
 thread (as configs/field.yaml has them) against a thread for each.
@@ -26,7 +26,7 @@ from links.clock import host_time
 from links.recording import RecordingReader
 from links.runs.request import RunRequest
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 RECORDING = ROOT / "recordings" / "experiment_2.mcap"
 OWN_THREADS = tuple(f"stages.{name}.thread={name}" for name in ("sweep", "detect", "track", "aim"))
 

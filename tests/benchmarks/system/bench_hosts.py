@@ -1,6 +1,6 @@
 """Hosts: codec time compared with pickle, added latency of a hop over loopback TLS, and throughput.
 
-pytest tests/benchmarks/bench_hosts.py -s
+pytest tests/benchmarks/system/bench_hosts.py -s
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import pytest
 from flow.remote.codec import decode, encode
 from stages.messages import DroneFix, Image, SweptPulses
 
-sys.path.append(str(Path(__file__).parents[1] / "links" / "zenoh"))
+sys.path.append(str(Path(__file__).parents[2] / "links" / "zenoh"))
 from socket import SOCK_STREAM
 
 from certificates import make_all, need_openssl

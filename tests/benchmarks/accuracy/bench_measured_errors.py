@@ -1,6 +1,6 @@
 """Errors of what the fusion receives in recorded flights, from which its constants were taken.
 
-    GRD_FLIGHTS='out/cells/*.mcap' python -m pytest tests/benchmarks/bench_measured_errors.py -s
+    GRD_FLIGHTS='out/cells/*.mcap' python -m pytest tests/benchmarks/accuracy/bench_measured_errors.py -s
 
 LiDAR positions: variance about their mean over the reported one, its correlation in time, and the variance of the mean
 over that of the reported bias (stages/fuse/settings.py). Matches of both cameras: the constants of the softmax that
@@ -26,7 +26,7 @@ from stages.align.pairing import Pairing
 from stages.align.spectra import level_lines, overlap, peaks, quarter_difference, spectrum
 from tests.stages.fuse.flown import RecordedFlight, recorded_inputs
 
-CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+CONFIGS = Path(__file__).resolve().parents[3] / "configs"
 FLIGHTS = sorted(glob.glob(os.environ.get("GRD_FLIGHTS", "")))
 LAGS_S = (0.1, 0.2, 0.3, 0.5, 1.0)
 RIGHT_RAD, APART_RAD, STRAIGHT_RAD = math.radians(3.0), math.radians(4.0), math.radians(0.25)

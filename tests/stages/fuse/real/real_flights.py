@@ -36,7 +36,7 @@ from stages.messages import (
 )
 from stages.odometry.drone import IndependentTelemetry, InertialMotion
 from tests.stages.fuse.imu_flights import FIRST_FIX_S, gauss_markov, ns
-from tests.stages.fuse.pixhawk_log import LOG, PixhawkLog, pixhawk_log, reference
+from tests.stages.fuse.real.pixhawk_log import LOG, PixhawkLog, pixhawk_log, reference
 
 LATE_S = 0.03  # of telemetry
 TELEMETRY_PORTS = {DroneImu: "imu", DroneAttitude: "attitude", DroneLocalPosition: "position"}

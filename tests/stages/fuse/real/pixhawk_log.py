@@ -25,7 +25,7 @@ from scipy.interpolate import CubicHermiteSpline, CubicSpline
 from links.mavlink.ned_frd import R_odom_drone_from_rpy, flip_yz
 from stages.kernels.geometry.so3 import exp_rotation
 
-LOG = Path(__file__).resolve().parents[4] / "shared" / "data" / "mavlink" / "copter_dataflash_imu50.bin"
+LOG = Path(__file__).resolve().parents[5] / "shared" / "data" / "mavlink" / "copter_dataflash_imu50.bin"
 G = 9.80665
 FLYING_S = 14.0, 323.0  # since the first IMU sample: take-off and landing left out
 GPS_MPS, GPS_M = 0.15, 5.0  # one sigma, one axis, of GPS velocities and of their integral against drift

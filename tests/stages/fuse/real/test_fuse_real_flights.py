@@ -1,6 +1,6 @@
 """Flights of real drones through the stages of configs/estimate.yaml: heading, errors and gaps, as tables.
 
-    python -m pytest -m slow -n 0 tests/stages/fuse/test_fuse_real_flights.py -s     about 15 min of one core
+    python -m pytest -m slow -n 0 tests/stages/fuse/real/test_fuse_real_flights.py -s     about 15 min of one core
 
 The yaw is compared with a batch over the whole flight by GPS and the other IMU; that of two IMUs differs by 1.3 deg RMS
 (pixhawk_log.py), and the autopilot's own yaw (compass) by 4 deg from both. The column `wrong` counts headings that were
@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from tests.stages.fuse.judged import HEADER, Flown, fly, rms, row
-from tests.stages.fuse.pixhawk_log import LOG, degrees_between, latency_s, pixhawk_log, reference, yaw_rad
-from tests.stages.fuse.real_flights import TRACKS, PixhawkFlight, TrackFlight, tracks
+from tests.stages.fuse.real.pixhawk_log import LOG, degrees_between, latency_s, pixhawk_log, reference, yaw_rad
+from tests.stages.fuse.real.real_flights import TRACKS, PixhawkFlight, TrackFlight, tracks
 
 pytestmark = pytest.mark.slow
 WINDOWS = 40

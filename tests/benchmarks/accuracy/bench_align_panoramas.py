@@ -1,6 +1,6 @@
 """Rotation between an up- and a down-looking fisheye rendered from real panoramas: matches, errors, stated probability.
 
-    GRD_RENDERS=40 python -m pytest tests/benchmarks/bench_align_panoramas.py -s
+    GRD_RENDERS=40 python -m pytest tests/benchmarks/accuracy/bench_align_panoramas.py -s
 
 GRD_RENDERS (10) pairs of each panorama, disturbed as in bench_vp_panoramas.py; both cameras are at the panorama's
 place. A match is right when it is less than 2 deg off on one of its branches. The prior of 8 deg stands for a heading

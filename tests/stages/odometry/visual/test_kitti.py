@@ -17,7 +17,7 @@ from stages.messages import Image, VisualMotion
 from stages.odometry.drone import FisheyeOdometry
 from tests.stages.seen import degrees_between, of, pinhole
 
-DRIVE = Path(__file__).resolve().parents[4] / "shared" / "data" / "vo_kitti00"
+DRIVE = Path(__file__).resolve().parents[5] / "shared" / "data" / "vo_kitti00"
 STEP_NS = 100_000_000
 pytestmark = pytest.mark.skipif(not DRIVE.exists(), reason="needs ../shared/data/vo_kitti00")
 

@@ -1,6 +1,6 @@
 """Vanishing directions on renders of four real panoramas: is the stated sigma true, and are there wrong answers?
 
-    GRD_RENDERS=100 python -m pytest tests/benchmarks/bench_vp_panoramas.py -s
+    GRD_RENDERS=100 python -m pytest tests/benchmarks/accuracy/bench_vp_panoramas.py -s
 
 GRD_RENDERS (20) renders of each panorama and camera: 235 deg fisheye of 720 px, any yaw, tilted as a vehicle or a
 drone, with exposure, blur, noise, JPEG, people, and in half of them a printed board. One panorama is kept back: no

@@ -7,7 +7,7 @@ import pytest
 
 from stages.geometry.frames import rotation_z
 from stages.odometry.drone.autopilot_estimate import AutopilotEstimate
-from tests.stages.odometry.made_imu import R_odom_drone, attitude, imu, local_position, odometry, stamp
+from tests.stages.odometry.drone.made_imu import R_odom_drone, attitude, imu, local_position, odometry, stamp
 
 
 def fly(estimate: AutopilotEstimate, from_ms: float, to_ms: float, period_ms: float = 40, **position: float) -> None:

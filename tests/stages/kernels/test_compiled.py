@@ -68,9 +68,9 @@ def test_a_changed_callee_in_another_file_is_detected(tmp_path):
     """With the cache named after these files; numba alone would keep the old code."""
     (tmp_path / "caller.py").write_text(CALLER)
     program = (
-        "import sys, pathlib, stages.kernels.compiled, flow.compile_cache as c\n"
+        "import sys, pathlib, stages.kernels.compiled, flow.compile_cache as c\nfrom numba.core import config\n"
         f"here = pathlib.Path({str(tmp_path)!r}); sys.path.insert(0, str(here))\n"
-        "c.config.CACHE_DIR = str(here / 'cache' / (c.cache_name([here]) if sys.argv[1] == 'ours' else 'one'))\n"
+        "config.CACHE_DIR = str(here / 'cache' / (c.cache_name([here]) if sys.argv[1] == 'ours' else 'one'))\n"
         "from caller import outer\n"
         "print(outer(1))\n"
     )

@@ -19,7 +19,7 @@ from flow.link import TRUTH_TOPICS, LinkError, Record
 from links.lidar import packet_format
 from links.recording import RecordingWriter
 from links.simulated.autopilot.autopilot import Autopilot
-from links.simulated.autopilot.flight_stack.outcome import Outcome
+from links.simulated.autopilot.flight_stack.outcomes.outcome import Outcome
 from links.simulated.autopilot.flight_stack.stack import FlightStack
 from links.simulated.kernels.lidar import lidar_poses
 from links.simulated.pose_sensors.fix_sensor import FixSensor

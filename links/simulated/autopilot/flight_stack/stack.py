@@ -24,7 +24,6 @@ from links.simulated.autopilot.flight_stack.commands import handle_frame, send_o
 from links.simulated.autopilot.flight_stack.downlink import Downlink
 from links.simulated.autopilot.flight_stack.estimation.estimator import Estimators
 from links.simulated.autopilot.flight_stack.estimation.source_rules import EKF_CHECK_HZ, SOURCE_SETS, AidingSource
-from links.simulated.autopilot.flight_stack.events import EventKind, FlightEvent
 from links.simulated.autopilot.flight_stack.failsafe import EkfAction, EkfCheck, arming_refusal
 from links.simulated.autopilot.flight_stack.guidance import (
     LAND_FAST_ABOVE_M,
@@ -36,6 +35,7 @@ from links.simulated.autopilot.flight_stack.guidance import (
     SurveyFrame,
     rotate,
 )
+from links.simulated.autopilot.flight_stack.outcomes.events import EventKind, FlightEvent
 from links.simulated.autopilot.flight_stack.quadrotor import TICK_S, Quadrotor
 from links.simulated.autopilot.flight_stack.sensors import Sensors
 from links.simulated.autopilot.flight_stack.settings import Hold, TakeOff, UseSources

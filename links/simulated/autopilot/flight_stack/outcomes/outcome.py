@@ -15,8 +15,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from flow.link import Record
-from links.simulated.autopilot.flight_stack.events import EventKind
-from links.simulated.autopilot.flight_stack.sent_poses import SentPoses
+from links.simulated.autopilot.flight_stack.outcomes.events import EventKind
+from links.simulated.autopilot.flight_stack.outcomes.sent_poses import SentPoses
 from links.simulated.autopilot.flight_stack.stack import FlightStack
 from links.simulated.kernels.motion import STEP_S
 from links.simulated.sensors.vehicle_odometry import VehicleOdometry

@@ -212,7 +212,10 @@ class Camera:
         sun_px = self.settings.true_lens.project((scene.light.sun_direction @ R[0])[None])[0]
         if np.isfinite(sun_px).all() and scene.light.sun_rgb.any() and scene.sees_sun(t[0], at):
             centre_px = np.array(self.settings.true_lens.centre_px)
-            flare(radiance, sun_px, centre_px, self.settings.flare, scene.light.sun_rgb)
+            added = np.zeros_like(radiance)
+            flare(added, sun_px, centre_px, self.settings.flare, scene.light.sun_rgb)
+            inside = self._pixels.rows, self._pixels.columns
+            radiance[inside] += added[inside]
 
     def _record(self, frame: int) -> Record:
         stamp_ns = self._times.stamp_ns(frame)

@@ -21,9 +21,10 @@ from links.simulated.world.procedural.settings import KERB_HEIGHT_M, SceneSettin
 from stages.geometry.frames import Array64, rotation_from_rpy_deg, rotation_z
 
 REACH_M = 45.0  # of the clutter along the road, each way
-PER_100_M2 = 3.0  # static objects on the pavements
+PER_100_M2 = 7.0  # static objects on the pavements
 OBLIQUE_WIRES = 8
 PEOPLE = 16
+WALLED = ("street", "manhattan", "atlanta")  # with a wall behind the pavement, for plates to hang on
 GAIT_STEPS = 4
 GAIT_HZ = 0.9  # full cycles of two steps
 
@@ -41,7 +42,7 @@ def clutter(settings: SceneSettings, corridor: VehicleCorridor, rng: Generator) 
             turned = made.moved((x, y, KERB_HEIGHT_M), rotation_z(rng.uniform(0, 2 * np.pi)))
             if corridor.allows(x, y, radius_m):
                 parts.append(turned)
-            if rng.uniform() < 0.5:
+            if settings.kind in WALLED and rng.uniform() < 0.4:
                 at = rng.uniform(-REACH_M, REACH_M), side * (high + 0.5), rng.uniform(2.8, 7.0)
                 parts.append(_hung(rng).moved(at, rotation_z(rng.normal(0, 0.6))))
         x = rng.uniform(-REACH_M, REACH_M)

@@ -7,8 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import yaml
 
 from stages.geometry.frames import Pose
 from stages.messages import CameraMount, VanishingDirections
@@ -44,15 +46,24 @@ def of_views(scene: str, seeds: Iterable[int], count: int, clutter: bool) -> dic
     return found
 
 
-def _stages(view: View) -> dict[str, GreatCircleVp | PaperVp]:
-    import yaml
+def _rig(view: View) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Settings that all stages share, and the camera as the rig file states it."""
+    name = view.camera_mount.value
+    rig = yaml.safe_load(view.scenario.rig_yaml())["cameras"][name]
+    mount = Pose.model_validate(rig[f"T_{name}_camera"])
+    return {"camera_mount": view.camera_mount, "T_mount_camera": mount, "lens": rig["lens"]}, rig
 
-    rig = yaml.safe_load(view.scenario.rig_yaml())["cameras"][view.camera_mount.value]
-    mount = Pose.model_validate(rig[f"T_{view.camera_mount.value}_camera"])
-    common = {"camera_mount": view.camera_mount, "T_mount_camera": mount, "lens": rig["lens"]}
-    body = {"masked_px": rig["masked_px"], "max_off_axis_deg": rig["max_off_axis_deg"]}
+
+def grd_stage(view: View) -> GreatCircleVp:
+    """grd's stage for the camera of a view."""
+    common, rig = _rig(view)
+    return GreatCircleVp(**common, masked_px=rig["masked_px"], max_off_axis_deg=rig["max_off_axis_deg"])
+
+
+def _stages(view: View) -> dict[str, GreatCircleVp | PaperVp]:
+    common, rig = _rig(view)
     paper = {name: PaperVp(**common, size_px=rig["size_px"], **settings) for name, settings in PAPER.items()}
-    return {"grd": GreatCircleVp(**common, **body), **paper}
+    return {"grd": grd_stage(view), **paper}
 
 
 def answer(found: VanishingDirections, R_world_mount: np.ndarray, truth: np.ndarray) -> Answer:

@@ -167,6 +167,7 @@ class CameraScene:
         if self.light.sun_rgb.any():
             self._light_samples(found, None)
         seen = face >= 0
+        found.ranges += samples.ranges[glass]  # the size of a sample and the haze are those of the whole path
         mirrored[glass[seen]] = self._shade(found, pixel_rad, NO_MIRROR)[seen]
         return mirrored
 

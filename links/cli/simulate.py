@@ -130,7 +130,7 @@ def simulate_matrix(
         bool,
         typer.Option(
             "--clutter",
-            help="Furniture, signs, boards, wires, people, reflections; of the cameras a rolling shutter, dirt and flare.",
+            help="Furniture, signs, boards, wires, people, reflections; cameras with rolling shutter, dirt and flare.",
         ),
     ] = False,
     lidar: Annotated[

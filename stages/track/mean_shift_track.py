@@ -16,7 +16,8 @@ While TRACKING, detections are not used, as in the paper, with one exception for
 is reset to a detection if `rival_sweeps` successive sweeps accept a drone farther than r from it and none within r, or
 one sweep does so in which the track had no return. `rival_sweeps: null` is the paper's method.
 
-Source: P III.C, Equation 6 (r = 1 m, n_max = 10, frames of 120 ms, first the initial scan); states, covariance and rivals are ours.
+Source: P III.C, Equation 6 (r = 1 m, n_max = 10, first the initial scan, then frames of 120 ms); states, covariance and
+rivals are ours.
 """
 
 from __future__ import annotations

@@ -145,7 +145,7 @@ def radiance(
     """Linear RGB (n, 3) of samples: world directions, hit points and normals (n, 3), ranges (n,).
 
     `surface` (n,) is the row of SURFACES, -1 for sky. `window` (n, 4): position on the quadrilateral and its sides [m].
-    `lit` marks the samples in direct sun. `mirrored` (n, 3): what a glossy sample reflects, -1 for the sky; empty: the sky.
+    `lit` marks the samples in direct sun. `mirrored` (n, 3): what a glossy sample reflects; -1, or empty: the sky.
     """
     return kernels.shade(
         directions, points, normals, ranges, surface, tint, window, lit, pixel_rad, street.numbers(),

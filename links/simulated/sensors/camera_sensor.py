@@ -2,7 +2,8 @@
 
 Source: EMVA Standard 1288 release 4.0, section 2 (electrons are Poisson, so their variance is their mean; read noise
 adds; full well clips); Hullin et al., ACM Trans. Graphics 30 (2011) 108, for flare (ghosts lie on the line through the
-images of sun and axis; their sizes and strengths, and the dirt, are ours); ITU-R BT.709-style power of 1/2.2 for gamma. Numbers of a small global-shutter sensor.
+images of sun and axis; their sizes and strengths, and the dirt, are ours); ITU-R BT.709-style power of 1/2.2 for gamma.
+Numbers of a small global-shutter sensor.
 """
 
 from __future__ import annotations
@@ -76,7 +77,7 @@ def dirt(rows: NDArray[np.intp], columns: NDArray[np.intp], size_px: int, spots:
             shape = np.exp(-((across / (0.0018 * size_px)) ** 2)) * (np.abs(along) < reach)
         else:
             stretch = rng.uniform(0.6, 1.6)
-            shape = np.exp(-(((x * stretch) ** 2 + (y / stretch) ** 2) / radius**2) ** 1.5)
+            shape = np.exp(-((((x * stretch) ** 2 + (y / stretch) ** 2) / radius**2) ** 1.5))
         clean *= 1.0 - rng.uniform(0.2, 0.7) * shape
     return clean.astype(np.float32)
 

@@ -106,13 +106,11 @@ class FeatureTracker:
         side = patches.SIDE_PX
         self._templates = _Templates(np.zeros((0, side, side), np.float32), np.zeros((0, 3, 3)))
 
-    def follow(
-        self, stamp_ns: int, grey: Grey, R_now_before: Array64, turn_rad_per_row: Array64 = NO_TURN
-    ) -> Tracks:
+    def follow(self, stamp_ns: int, grey: Grey, R_now_before: Array64, turn_rad_per_row: Array64 = NO_TURN) -> Tracks:
         """Tracks that are found in the next image. `R_now_before` is the expected rotation.
 
-        `turn_rad_per_row` (3,): rotation of the camera between the exposures of two rows, camera axes. Rays are those of
-        the camera axes at the exposure of the middle row.
+        `turn_rad_per_row` (3,): rotation of the camera between the exposures of two rows, camera axes. Rays are those
+        of the camera axes at the exposure of the middle row.
         """
         self._turn_rad_per_row = turn_rad_per_row
         if self._before is None or grey.shape != self._before.shape:

@@ -65,9 +65,7 @@ def test_the_gyro_corrects_a_rolling_shutter():
             if with_gyro:
                 gravity = np.array([0.0, 0.0, 9.81])
                 odometry.on_imu(
-                    DroneImu(
-                        stamp_ns=stamp_ns, acceleration_drone_mps2=gravity, angular_velocity_drone_radps=rate
-                    )
+                    DroneImu(stamp_ns=stamp_ns, acceleration_drone_mps2=gravity, angular_velocity_drone_radps=rate)
                 )
             image = Image(stamp_ns=stamp_ns, frame_id="camera_drone", grey=grey, readout_s=readout_s)
             motion = of(odometry.on_image(image), VisualMotion)

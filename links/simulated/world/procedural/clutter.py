@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.random import Generator
@@ -66,7 +67,9 @@ def _table_and_chairs(rng: Generator) -> Mesh:
     size = rng.uniform(0.35, 0.5)
     parts = [box((-size, -size, 0.70), (size, size, 0.74), "bark"), rod((0, 0, 0), (0, 0, 0.7), 0.04, "metal")]
     for angle in np.radians(np.arange(0, 360, 90) + rng.uniform(-25, 25, 4)):
-        seat = merge([box((-0.2, -0.2, 0.42), (0.2, 0.2, 0.46), "metal"), box((0.16, -0.2, 0.46), (0.2, 0.2, 0.9), "bark")])
+        seat = merge(
+            [box((-0.2, -0.2, 0.42), (0.2, 0.2, 0.46), "metal"), box((0.16, -0.2, 0.46), (0.2, 0.2, 0.9), "bark")]
+        )
         legs = merge([rod((x, y, 0), (x, y, 0.42), 0.015, "metal", 3) for x in (-0.18, 0.18) for y in (-0.18, 0.18)])
         at = 0.85 * np.array([np.cos(angle), np.sin(angle), 0.0])
         parts.append(merge([seat, legs]).moved(at, rotation_z(angle + rng.uniform(-0.5, 0.5))))
@@ -113,7 +116,9 @@ def _sign(rng: Generator) -> Mesh:
     for k in range(rng.integers(1, 3)):
         half, high = rng.uniform(0.25, 0.6), rng.uniform(0.25, 0.45)
         plate = merge([box((-half, 0.04, -high), (half, 0.06, high), "print"), _frame(half, high)])
-        parts.append(plate.moved((0, 0, 0.5 - 1.0 * k), rotation_from_rpy_deg((0, rng.normal(0, 6), rng.uniform(0, 360)))))
+        parts.append(
+            plate.moved((0, 0, 0.5 - 1.0 * k), rotation_from_rpy_deg((0, rng.normal(0, 6), rng.uniform(0, 360))))
+        )
     return _tilted(merge(parts), rng, 3.0, 2.5)
 
 
@@ -146,7 +151,11 @@ def _awning(rng: Generator) -> Mesh:
     half, drop = rng.uniform(0.8, 1.5), rng.uniform(0.3, 0.7)
     if rng.uniform() < 0.5:
         sheet = quads([[(-half, 0, 2.9), (half, 0, 2.9), (half, -1.2, 2.9 - drop), (-half, -1.2, 2.9 - drop)]], "print")
-        legs = [rod((x, y, 0), (x, y, z), 0.02, "metal", 4) for x in (-half, half) for y, z in ((0, 2.9), (-1.2, 2.9 - drop))]
+        legs = [
+            rod((x, y, 0), (x, y, z), 0.02, "metal", 4)
+            for x in (-half, half)
+            for y, z in ((0, 2.9), (-1.2, 2.9 - drop))
+        ]
         return merge([sheet, *legs])
     sag = rng.normal(0, 0.25)
     sheet = quads([[(-half, 0, 3.2), (half, 0, 3.2 + sag), (half, 0.1, 4.0 + sag), (-half, 0.1, 4.0)]], "print")
@@ -165,9 +174,14 @@ def _bicycle(rng: Generator) -> Mesh:
     wheels = [
         rod((x + a, 0, 0.33 + b), (x + c, 0, 0.33 + d), 0.02, "rubber", 3)
         for x in (-0.5, 0.5)
-        for (a, b), (c, d) in zip(ring[:-1], ring[1:], strict=True)
+        for (a, b), (c, d) in pairwise(ring)
     ]
-    tubes = [((-0.5, 0.33), (-0.1, 0.85)), ((-0.1, 0.85), (0.4, 0.9)), ((0.4, 0.9), (0.5, 0.33)), ((-0.1, 0.4), (0.4, 0.85))]
+    tubes = [
+        ((-0.5, 0.33), (-0.1, 0.85)),
+        ((-0.1, 0.85), (0.4, 0.9)),
+        ((0.4, 0.9), (0.5, 0.33)),
+        ((-0.1, 0.4), (0.4, 0.85)),
+    ]
     frame = [rod((a[0], 0, a[1]), (b[0], 0, b[1]), 0.02, "paint_dark", 3) for a, b in tubes]
     return _tilted(merge([*wheels, *frame]), rng, 6.0, 0.0)
 

@@ -1,9 +1,9 @@
-"""Draw images/reliability.png: stated against actual errors of vanishing directions, simulated and real side by side.
+"""Draw docs/images/reliability.png: stated against actual errors of vanishing directions, simulated beside real.
 
-    python docs/reliability.py [IMAGES_PER_CAMERA]
+    python -m tests.benchmarks.draw_reliability [IMAGES_PER_CAMERA]
 
 Needs the extras `evaluate` and `simulate`. The real half needs ../shared/data (panoramas, York Urban, corridor) and is
-empty without it. Prints one line per group; writes pictures of simulated failures to images/vp_failure_*.jpg.
+empty without it. Prints one line per group; writes pictures of simulated failures to docs/images/vp_failure_*.jpg.
 """
 
 from __future__ import annotations
@@ -15,11 +15,8 @@ from pathlib import Path
 import cv2
 import matplotlib
 import numpy as np
+from matplotlib import pyplot as plt
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 
 from stages.geometry.frames import Pose
 from stages.geometry.lens_files import lens_from_ocamcalib
@@ -31,7 +28,7 @@ from tests.stages.panoramas import Answer
 from tests.stages.reliability import DATA, answer, grd_stage
 from tests.stages.simulated_views import SCENES, View, views
 
-IMAGES = Path(__file__).resolve().parent / "images"
+IMAGES = Path(__file__).resolve().parents[2] / "docs" / "images"
 FORWARD = Pose(quaternion_xyzw=(-0.5, 0.5, -0.5, 0.5))
 SEED = 201  # of worlds that no threshold was chosen with
 MOST_PICTURES = 3
@@ -41,8 +38,9 @@ Groups = dict[str, list[Answer]]
 def main() -> None:
     """Compute both halves, print the table, draw the figure."""
     count = int(sys.argv[1]) if len(sys.argv) > 1 else 5
+    matplotlib.use("Agg")
+    print(corridor())  # noqa: T201
     real = real_groups(4 * count)
-    print(corridor())
     simulated = simulated_groups(count)
     figure, both = plt.subplots(1, 2, figsize=(9.5, 4.0), sharey=True, layout="constrained")
     for axes, title, groups in zip(both, ("simulated", "real"), (simulated, real), strict=True):
@@ -60,11 +58,8 @@ def draw(axes: plt.Axes, title: str, groups: Groups) -> None:
         axes.plot(k, [(error < at * sigma).mean() for at in k], label=f"{name} ({len(found)} images)")
         share = ", ".join(f"{100 * np.mean(error < at * sigma):.1f}" for at in (1, 2, 3))
         frames, wrong = 100 * np.mean([a.has_frame for a in found]), sum(a.wrong for a in found)
-        print(
-            f"| {title}, {name} | {len(found)} | {frames:.0f} | {np.median(error):.2f}, {np.quantile(error, 0.95):.2f} | "
-            f"{np.median(sigma):.2f} | {share} | {wrong} |",
-            flush=True,
-        )
+        errors = f"{np.median(error):.2f}, {np.quantile(error, 0.95):.2f} | {np.median(sigma):.2f}"
+        print(f"| {title}, {name} | {len(found)} | {frames:.0f} | {errors} | {share} | {wrong} |")  # noqa: T201
     axes.set(title=title, xlabel="error / stated sigma", ylim=(0, 1.02), xlim=(0, 6))
     axes.legend(loc="lower right", fontsize=7)
 
@@ -108,7 +103,7 @@ def save_failure(file: Path, scene: str, view: View, ends: np.ndarray, result: A
     for row, line in enumerate(text):
         cv2.putText(bar, line[:110], (6, 20 + 22 * row), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (0, 0, 0), 1, cv2.LINE_AA)
     cv2.imwrite(str(file), np.vstack([picture, bar]), [cv2.IMWRITE_JPEG_QUALITY, 70])
-    print(f"{file.name}: {' | '.join(text)}", flush=True)
+    print(f"{file.name}: {' | '.join(text)}")  # noqa: T201
 
 
 def real_groups(count: int) -> Groups:
@@ -152,7 +147,7 @@ def forward_stage(lens: object) -> GreatCircleVp:
 
 
 def corridor() -> str:
-    """Angles between the directions in the real corridor, each from its own lines alone: right angles by construction."""
+    """Angles between the directions in the real corridor, each by its own lines alone; the building's are right."""
     folder = DATA / "fisheye"
     if not folder.exists():
         return "corridor: not here"
@@ -165,7 +160,8 @@ def corridor() -> str:
         d[k] = np.linalg.svd(weighted)[2][-1]
     off = [90.0 - math.degrees(math.acos(abs(float(d[i] @ d[j])))) for i in range(len(d)) for j in range(i)]
     sigma = ", ".join(f"{s:.2f}" for s in np.degrees(found.sigma_rad))
-    return f"corridor: {len(d)} directions, each by its lines off square by {', '.join(f'{o:.2f}' for o in off)} deg; sigma {sigma} deg"
+    angles = ", ".join(f"{angle:.2f}" for angle in off)
+    return f"corridor: {len(d)} directions, each by its lines off square by {angles} deg; sigma {sigma} deg"
 
 
 if __name__ == "__main__":

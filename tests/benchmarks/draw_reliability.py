@@ -17,7 +17,6 @@ import matplotlib
 import numpy as np
 from matplotlib import pyplot as plt
 
-
 from stages.geometry.frames import Pose
 from stages.geometry.lens_files import lens_from_ocamcalib
 from stages.messages import CameraMount, Image

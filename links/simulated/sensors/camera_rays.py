@@ -230,7 +230,7 @@ class CameraScene:
             rotate_normals(pick, moment, R, samples.normals)
 
     def _light_samples(self, samples: Samples, moment_ns: NDArray[np.int64] | None) -> None:
-        """Mark the samples in direct sun; shadows of bodies are those in the middle of the exposure; None: of no body."""
+        """Mark the samples in direct sun; bodies cast shadows as in the middle of the exposure; None: no bodies."""
         sun = self.light.sun_direction
         pick, origins = shadow_rays(
             samples.points, samples.normals, samples.directions, samples.surface, samples.ranges, sun

@@ -21,10 +21,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
-from scipy.spatial.transform import Rotation
 
 from stages.geometry.frames import Array64
 from stages.geometry.lens import Equidistant, KannalaBrandt, OCam
+from stages.kernels.geometry.so3 import exp_rotation
 from stages.kernels.visual import patches
 from stages.kernels.visual.features import best_per_cell
 from stages.kernels.visual.patches import Array32, Grey
@@ -216,7 +216,8 @@ class FeatureTracker:
 
 def at_middle_row(ray: Array64, rows_after: Array64, turn_rad_per_row: Array64) -> Array64:
     """Rays (n, 3) of rows exposed `rows_after` (n,) the middle one, in the camera axes of the middle row."""
-    return Rotation.from_rotvec(rows_after[:, None] * turn_rad_per_row).apply(ray)
+    turns = rows_after[:, None] * turn_rad_per_row
+    return np.array([exp_rotation(turn) @ r for turn, r in zip(turns, ray, strict=True)]).reshape(-1, 3)
 
 
 def usable_pixels(lens: Equidistant | KannalaBrandt | OCam, settings: FeatureSettings, shape: tuple[int, int]) -> Grey:

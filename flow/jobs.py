@@ -16,7 +16,7 @@ import os
 import signal
 import time
 import uuid
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import ExitStack, contextmanager
 from typing import Any, TypeVar
 
@@ -109,10 +109,10 @@ def _wait_for_running(client: Any, run: str) -> None:
 
 
 @contextmanager
-def _client(workers: Workers, tasks: int) -> Iterator[Any]:
+def _client(workers: Workers, tasks: int) -> Generator[Any, None, None]:
     """A client of a scheduler: of one at an address, or of one with processes of this machine."""
-    import dask
     import distributed
+    from dask import config  # pyright: ignore[reportPrivateImportUsage]
 
     if isinstance(workers, str):
         try:
@@ -123,14 +123,15 @@ def _client(workers: Workers, tasks: int) -> Iterator[Any]:
             yield client
         return
     settings = {"distributed.scheduler.allowed-failures": LOST_WORKERS}
-    with dask.config.set(settings), ExitStack() as stack:
+    with config.set(settings), ExitStack() as stack:
         with _interrupts_ignored():  # inherited by the processes that start here
+            no_dashboard: Any = None
             cluster = distributed.LocalCluster(
                 n_workers=min(workers, tasks),
                 threads_per_worker=1,
                 host="127.0.0.1",
-                dashboard_address=None,
-                memory_limit=0,
+                dashboard_address=no_dashboard,
+                memory_limit=0,  # no limit
                 silence_logs=logging.CRITICAL,
             )
         stack.enter_context(cluster)
@@ -138,7 +139,7 @@ def _client(workers: Workers, tasks: int) -> Iterator[Any]:
 
 
 @contextmanager
-def _interrupts_ignored() -> Iterator[None]:
+def _interrupts_ignored() -> Generator[None, None, None]:
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         yield

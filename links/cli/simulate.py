@@ -38,7 +38,7 @@ SchedulerOption = Annotated[
     typer.Option(
         "--scheduler",
         metavar="ADDRESS",
-        help="Run on the workers of a dask scheduler, as tcp://127.0.0.1:8786; they need the same files at the same paths.",
+        help="Run on the workers of a dask scheduler, as tcp://127.0.0.1:8786, with the same files at the same paths.",
     ),
 ]
 

@@ -159,6 +159,7 @@ class Simulation:
             vehicle_mesh_from_camera(height, scenario.mount),
             scenario.start_ns,
             self.seed,
+            reflections=scenario.scene.clutter,
         )
 
     def records(self) -> Iterator[Record]:

@@ -30,7 +30,7 @@ from links.evaluation.run_data import XYZ, RotationLog, Search
 from links.evaluation.text_files import Flags, Trajectory
 from stages.geometry.frames import Array64
 
-PROBABILITY_EDGES = (0.0, 0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 0.95, 1.0)  # the detector accepts from 0.95 on
+PROBABILITY_EDGES = (0.0, 0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 0.95, 1.0)  # bins of the reliability table
 FALSE_DETECTIONS = "false_detections_per_min"
 NO_SEARCH = "no complete search with a drone in reach"
 PUBLISHED, MODULO_90 = "rotation_published", "rotation_modulo_90"

@@ -20,6 +20,8 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from flow.link import LinkError
+from links.evaluation.errors import brier_and_log_loss
+from links.evaluation.stage_metrics import SCORE_RANGES_M
 from links.training.candidates import CandidateRows
 from stages.detect.trained.features import FEATURES, NAMES, RANGE, TELEMETRY, VERSION
 from stages.detect.trained.model import ALTERNATIVES, ANY, FAR, NEAR, At, DetectorModel, Term, farness
@@ -35,7 +37,6 @@ PRIOR_PENALTY = 0.02  # assumed; of the priors, relative to the other parameters
 STRENGTHS = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0)  # of the penalty
 FOLDS = 3
 EASY_SHARE = 0.05  # assumed; of the single observations without telemetry that are used; they are most of all rows
-RANGES_M = (0.0, 15.0, 25.0, 35.0, 70.0)  # bands of the scores
 USED: tuple[tuple[str, ...], ...] = (  # features of each alternative
     (
         "existence_nats", "false_per_s", "range_m", "scan_passes", "age_s", "first_returns", "return_ratio",
@@ -111,17 +112,17 @@ def predicted(model: DetectorModel, rows: CandidateRows) -> Array64:
 
 def scores(rows: CandidateRows, probability: Array64) -> list[Score]:
     """Brier score and log loss [nats] by range band, with and without telemetry."""
-    p = np.clip(probability, 1e-6, 1 - 1e-6)
-    brier, loss = (p - rows.is_drone) ** 2, -np.log(np.where(rows.is_drone, p, 1 - p))
     found: list[Score] = []
     for telemetry in (True, False):
-        for low, high in pairwise(RANGES_M):
+        for low, high in pairwise(SCORE_RANGES_M):
             here = (rows.with_telemetry == telemetry) & (rows.feature("range_m") >= low)
             here &= rows.feature("range_m") < high
             if here.any():
                 name = f"{low:.0f} to {high:.0f} m, {'with' if telemetry else 'without'} telemetry"
                 drones = int(rows.is_drone[here].sum())
-                found.append(Score(name, int(here.sum()), drones, float(brier[here].mean()), float(loss[here].mean())))
+                found.append(
+                    Score(name, int(here.sum()), drones, *brier_and_log_loss(probability[here], rows.is_drone[here]))
+                )
     return found
 
 

@@ -46,9 +46,7 @@ class ImmPdaf:
 
     def __init__(self, xyz_m: Array64, stamp_ns: int, settings: ImmSettings) -> None:
         self._settings, self.stamp_ns = settings, stamp_ns
-        self._measurement = LinearGaussian(
-            ndim_state=6, mapping=POSITION, noise_covar=np.eye(3) * settings.sigma_m**2
-        )
+        self._measurement = LinearGaussian(ndim_state=6, mapping=POSITION, noise_covar=np.eye(3) * settings.sigma_m**2)
         self._updater = KalmanUpdater(self._measurement)
         self._associate = [_hypothesiser(noise, self._updater, settings) for noise in settings.noise_mps]
         mean = np.zeros(6)

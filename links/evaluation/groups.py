@@ -141,14 +141,14 @@ NOTE = (
     "Track accuracy (recall): share of the time with a current output within 1 m. Precision: share of the current "
     "outputs that are. GOSPA: mean over time, p = 2, cut-off 1 m, so 0.71 m without an output. Ever accurate, no "
     "output, mostly false: number of runs. Any return, observable: share of the time searched in searches with 1 or "
-    "more, with 4 or more returns of the drone. Detection rate: share of the time searched in searches whose best candidate is the drone; "
-    "of observable: share of the time of observable searches, any candidate. First accurate: time to the first "
-    "accurate output. Reacquired: after occlusions. Track losses: in sight. 3D RMSE: of runs with an accurate output. "
-    "False: outputs farther than 1 m from the drone; overconfident: by more than three of their own sigmas, too; false "
-    "tracks: of such outputs, with the bound of a Poisson process. "
-    "Sent: poses that the autopilot gate accepts, share of the time and largest errors. Medians and 95 % points count "
-    "a failed run as infinite ('never', or longer than the shortest failed run); maxima leave failed runs out. Each "
-    "of several drones counts as a run."
+    "more, with 4 or more returns of the drone. Detection rate: share of the time searched in searches whose best "
+    "candidate is the drone; of observable: share of the time of observable searches, any candidate. First accurate: "
+    "time to the first accurate output. Reacquired: after occlusions. Track losses: in sight. 3D RMSE: of runs with "
+    "an accurate output. False: outputs farther than 1 m from the drone; overconfident: by more than three of their "
+    "own sigmas, too; false tracks: of such outputs, with the bound of a Poisson process. Sent: poses that the "
+    "autopilot gate accepts, share of the time and largest errors. Medians and 95 % points count a failed run as "
+    "infinite ('never', or longer than the shortest failed run); maxima leave failed runs out. Each of several drones "
+    "counts as a run."
 )
 ROTATION_COLUMNS: Columns = {
     "runs": (0, len),

@@ -95,7 +95,8 @@ def train(
 ) -> DetectorModel:
     """The model of these rows, of runs with this LiDAR. `left_out`: features that it does not use (ablation).
 
-    `start`: a model of other rows; the penalty pulls to its weights. `strengths`: of the penalty, to choose from; None: STRENGTHS.
+    `start`: a model of other rows; the penalty pulls to its weights. `strengths`: of the penalty, to choose from (None:
+    STRENGTHS).
     """
     seeds = np.unique(rows.seed)
     if min(rows.is_drone.sum(), (~rows.is_drone).sum()) < 100 or len(seeds) < 2:

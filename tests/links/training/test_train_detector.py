@@ -164,12 +164,24 @@ def test_runs_that_cannot_be_used_are_named(tmp_path, runs):
         read_candidates([write_run(tmp_path / "old-s1-x", 1, drop=("scatter_m",))])
     with pytest.raises(LinkError, match="two seeds"):
         train(read_candidates(runs[:1]), {})
+
+
+@pytest.mark.parametrize(
+    ("column", "cell", "expected"),
+    [
+        ("range_m", "", "range_m is missing"),
+        ("range_m", "nan", "range_m is missing"),
+        ("top_mps", "fast", "top_mps is 'fast', not a finite number"),
+        ("top_mps", "inf", "top_mps is 'inf', not a finite number"),
+    ],
+)
+def test_a_value_that_is_no_number_is_named_with_its_line(tmp_path, column, cell, expected):
     broken = write_run(tmp_path / "broken-s1-x", 1)
     text = (broken / results.CANDIDATES_FILE).read_text().splitlines()
     cells = text[4].split(",")
-    cells[7] = ""
+    cells[text[0].split(",").index(column)] = cell
     (broken / results.CANDIDATES_FILE).write_text("\n".join([*text[:4], ",".join(cells), *text[5:]]) + "\n")
-    with pytest.raises(LinkError, match=r"candidates.csv:5: range_m is missing"):
+    with pytest.raises(LinkError, match=rf"candidates.csv:5: {expected}"):
         read_candidates([broken])
 
 

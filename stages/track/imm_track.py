@@ -139,7 +139,7 @@ class ImmPdafTrack(Stage[ImmPdafTrackSettings]):
             reason = "no cluster in the gate" if lost else f"{len(now.tracks)} tentative tracks"
             yield TrackState(stamp_ns=end_ns, state=state, reason=reason, hits=0, frame_s=frame_s)
             return
-        seen = best.filter.stamp_ns > end_ns - round(frame_s * 1e9)
+        seen = best.filter.stamp_ns >= end_ns - round(frame_s * 1e9)
         reason = f"{best.hits} frames, probability of a manoeuvre {best.filter.probabilities[1]:.2f}"
         yield TrackState(
             stamp_ns=end_ns, state=TrackingState.TRACKING, reason=reason, hits=int(seen), frame_s=frame_s,

@@ -84,7 +84,7 @@ def train_detector(
     if folders:
         unseen = read_candidates(folders)
         trained["held_out"] = _compared(unseen, predicted(model, unseen))
-        for group in GROUPS if ablation else ():
+        for group in ("nothing", *GROUPS) if ablation else ():
             names = [feature.name for feature in FEATURES if feature.group == group]
             less = train(rows, {}, [*(left_out or []), *names], lidar_model, start, [trained["strength"]])
             trained.setdefault("ablation", {})[group] = _ablated(group, unseen, predicted(less, unseen))

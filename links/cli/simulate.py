@@ -30,6 +30,18 @@ ClosedLoop = Annotated[
     ),
 ]
 
+JobsOption = Annotated[
+    int, typer.Option("--jobs", min=1, max=256, help="Number of processes; it does not affect the results.")
+]
+SchedulerOption = Annotated[
+    str | None,
+    typer.Option(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="Run on the workers of a dask scheduler, as tcp://127.0.0.1:8786, with the same files at the same paths.",
+    ),
+]
+
 
 @report_errors
 def simulate_recording(
@@ -156,9 +168,8 @@ def simulate_matrix(
             "CONFIG` of each recording, without the second pass, without .rrd file. For `grd evaluate OUT/*`.",
         ),
     ] = None,
-    jobs: Annotated[
-        int, typer.Option("--jobs", min=1, max=256, help="Number of processes; it does not affect the recordings.")
-    ] = 1,
+    jobs: JobsOption = 1,
+    scheduler: SchedulerOption = None,
     list_only: Annotated[bool, typer.Option("--list", help="Print the names of the cells and exit.")] = False,
 ) -> None:
     """Make the recordings of the scenario matrix.
@@ -206,7 +217,9 @@ def simulate_matrix(
     )
     several = range(first_seed, first_seed + seeds)
     with progress_bar(f"{len(selected) * seeds} recordings") as step:
-        report = make_matrix(folder, selected, several, closed_loop, step, conditions, results, jobs, images)
+        report = make_matrix(
+            folder, selected, several, closed_loop, step, conditions, results, scheduler or jobs, images
+        )
     _report(folder, report)
 
 
@@ -258,7 +271,8 @@ def fly_scenarios(
         list[str] | None,
         typer.Option("--set", metavar="KEY=VALUE", help="Change a setting of all scenarios; repeatable."),
     ] = None,
-    jobs: Annotated[int, typer.Option("--jobs", min=1, max=256, help="Number of processes.")] = 1,
+    jobs: JobsOption = 1,
+    scheduler: SchedulerOption = None,
 ) -> None:
     """Fly scenarios in closed loop and write a table: OUT/flights.md, and OUT/flights.csv with a line per flight.
 
@@ -276,7 +290,7 @@ def fly_scenarios(
 
     several = range(first_seed, first_seed + seeds)
     with progress_bar(f"{len(scenarios) * seeds} flights") as step:
-        results = fly_all(scenarios, sets or (), closed_loop, several, folder, jobs, step)
+        results = fly_all(scenarios, sets or (), closed_loop, several, folder, scheduler or jobs, step)
     for result in results:
         out.print(str(result), markup=False)
     table = markdown_table(results)

@@ -46,6 +46,8 @@ BODY_FRD = 12
 ATTITUDE, VELOCITY_HORIZONTAL, VELOCITY_VERTICAL, HORIZONTAL_RELATIVE = 1, 2, 4, 8
 HEIGHT, CONSTANT_POSITION = 32, 128
 
+MAGNETOMETER_UPDATED = 0b111 << 6  # HIGHRES_IMU_UPDATED_FLAGS
+
 
 def _vector(frame: Any, *names: str, unit: float = 1.0) -> NDArray[np.float64]:
     """Fields as a vector in grd's axes. Raises ValueError when one is not finite."""
@@ -100,21 +102,32 @@ def read_odometry(frame: Any, stamp_ns: int) -> DroneOdometry:
 
 
 def read_raw_imu(frame: Any, stamp_ns: int) -> DroneImu:
-    """RAW_IMU in ArduPilot's units, or SCALED_IMU: mg and mrad/s."""
+    """RAW_IMU in ArduPilot's units, or SCALED_IMU: mg, mrad/s and mgauss."""
     return DroneImu(
         stamp_ns=stamp_ns,
         acceleration_drone_mps2=_vector(frame, "xacc", "yacc", "zacc", unit=1e-3 * STANDARD_GRAVITY_MPS2),
         angular_velocity_drone_radps=_vector(frame, "xgyro", "ygyro", "zgyro", unit=1e-3),
+        magnetic_field_drone_ut=_magnetic_field(frame, 0.1),
     )
 
 
 def read_highres_imu(frame: Any, stamp_ns: int) -> DroneImu:
-    """HIGHRES_IMU: m/s^2 and rad/s."""
+    """HIGHRES_IMU: m/s^2, rad/s and gauss."""
     return DroneImu(
         stamp_ns=stamp_ns,
         acceleration_drone_mps2=_vector(frame, "xacc", "yacc", "zacc"),
         angular_velocity_drone_radps=_vector(frame, "xgyro", "ygyro", "zgyro"),
+        magnetic_field_drone_ut=_magnetic_field(frame, 100.0) if frame.fields_updated & MAGNETOMETER_UPDATED else None,
     )
+
+
+def _magnetic_field(frame: Any, unit_ut: float) -> NDArray[np.float64] | None:
+    """Field (3,) [uT] in drone axes; None: zero or not finite, no magnetometer."""
+    try:
+        field = _vector(frame, "xmag", "ymag", "zmag", unit=unit_ut)
+    except ValueError:
+        return None
+    return field if field.any() else None
 
 
 def read_ekf_status(frame: Any, stamp_ns: int) -> AutopilotEstimator:

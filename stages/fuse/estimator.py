@@ -77,8 +77,11 @@ class Estimator:
 
     def add_motion(self, motion: DroneMotion) -> None:
         """Add an IMU interval with the autopilot's vertical and, while independent, its odometry."""
-        if self.imu.add(motion):
-            self._autopilot.add(motion)
+        if not self.imu.add(motion):
+            return
+        self._autopilot.add(motion)
+        if motion.gyro_bias is not None:
+            (self.graph if self.graph.running else self.heading).add_vertical_gyro_bias(motion.gyro_bias)
 
     def add(self, measurement: Measurement) -> None:
         """Add a measurement; it is used when the horizon reaches its time."""
@@ -349,4 +352,4 @@ class Estimator:
         turn = bias_free_turn(self.imu, motion)
         if turn is not None:
             rate, by_images, covariance = turn
-            self.graph.add_gyro_bias(rate - by_images, math.sqrt(float(np.trace(covariance)) / 3))
+            self.graph.add_gyro_bias(rate - by_images, covariance)

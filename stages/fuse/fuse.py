@@ -102,8 +102,8 @@ class Fuse(Stage[FuseSettings]):
     def on_drone_motion(self, motion: DroneMotion) -> Poses:
         """Interval of the drone's IMU."""
         up = () if motion.up_drone is None else (motion.up_drone,)
-        noise = np.array([motion.specific_force_noise, motion.angular_velocity_noise])
-        numbers = (motion.specific_force_drone_mps2, motion.angular_velocity_drone_radps, noise, *up)
+        noise = motion.specific_force_noise, motion.angular_velocity_noise
+        numbers = (motion.specific_force_drone_mps2, motion.angular_velocity_drone_radps, *noise, *up)
         own = motion.autopilot
         more = () if own is None else (own.xyz_odom_m, own.R_odom_drone, own.velocity_odom_mps)
         if self._intake.is_valid(motion, "drone motion", *numbers, *more) and self._map_frame.is_fixed(motion.stamp_ns):

@@ -4,7 +4,8 @@
     k -- k+1          CombinedImuFactor, its noise as estimated from the IMU's stream
     X_k               GPSFactorArm: a LiDAR position; AttitudeFactorPose3: roll and pitch;
                       PoseRotationPrior3D: a rotation by vanishing points, referred to the key by the gyroscope
-    B_k               a prior of the gyroscope's bias, by the turn between two images
+    B_k               a prior of the gyroscope's bias, by the turn between two images, about the vertical by the
+                      magnetometer
     first key         the joint covariance (15, 15) of the bank: JacobianFactor in a LinearContainerFactor
 
 Each input is checked first; an error of GTSAM starts a new smoother at the last valid state with its joint covariance.
@@ -27,6 +28,7 @@ from stages.geometry.se3 import is_covariance
 from stages.heading.imu_buffer import ImuBuffer
 from stages.heading.inertial_state import ACCEL_WALK, GRAVITY_MPS2, GYRO_WALK, POSITION, ImuIntervals, InertialState
 from stages.kernels.geometry.so3 import exp_rotation
+from stages.messages import GyroBias
 
 RAISED = (RuntimeError, IndexError, ValueError)  # C++ exceptions through GTSAM's wrapper
 HUBER = 1.345  # [sigma]: 95 % efficient on Gaussian noise
@@ -34,7 +36,7 @@ KEY_NS = 200_000_000  # longest time between two keys
 NEWEST_NS = 2_000_000  # a measurement this close to the newest key is of its time
 FARTHEST_M = 1e5
 UP = gtsam.Unit3(np.array([0.0, 0.0, 1.0]))
-ANY_ACCEL_BIAS = 1e3  # [m/s^2] no information
+ANY_BIAS = 1e3  # [m/s^2], [rad/s] no information
 
 
 class InertialGraph:
@@ -115,13 +117,18 @@ class InertialGraph:
         self._pending.append(lambda n: gtsam.PoseRotationPrior3D(X(n), R, noise))
         return True
 
-    def add_gyro_bias(self, bias_radps: Array64, sigma_radps: float) -> None:
-        """Add a measurement of the gyroscope's bias."""
-        sigmas = np.array([ANY_ACCEL_BIAS] * 3 + [sigma_radps] * 3)
-        prior = gtsam.imuBias.ConstantBias(np.zeros(3), bias_radps)
-        huber = gtsam.noiseModel.mEstimator.Huber.Create(HUBER)
-        noise = gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Diagonal.Sigmas(sigmas))
+    def add_gyro_bias(self, bias_radps: Array64, covariance: Array64) -> None:
+        """Add a measurement of the gyroscope's bias (3,)."""
+        whole = ANY_BIAS**2 * np.eye(6)
+        whole[3:, 3:] = covariance
+        prior, noise = gtsam.imuBias.ConstantBias(np.zeros(3), bias_radps), _robust(whole)
         self._pending.append(lambda n: gtsam.PriorFactorConstantBias(B(n), prior, noise))
+
+    def add_vertical_gyro_bias(self, measured: GyroBias) -> None:
+        """Add a measurement of the gyroscope's bias about the vertical."""
+        up = measured.up_drone / np.linalg.norm(measured.up_drone)
+        covariance = ANY_BIAS**2 * np.eye(3) + (measured.sigma_radps**2 - ANY_BIAS**2) * np.outer(up, up)
+        self.add_gyro_bias(measured.bias_radps * up, covariance)
 
     def at(self, stamp_ns: int) -> InertialState:
         """The state (one row) propagated to a time."""
@@ -161,8 +168,8 @@ class InertialGraph:
     def _preintegrated(self, imu: ImuIntervals) -> Any:
         params: Any = gtsam.PreintegrationCombinedParams(GRAVITY_MPS2)
         share, three = imu.step_s / imu.seconds, np.eye(3)
-        params.setAccelerometerCovariance(float(share @ imu.force_noise**2) * three)
-        params.setGyroscopeCovariance(float(share @ imu.rate_noise**2) * three)
+        params.setAccelerometerCovariance(np.diag(share @ imu.force_noise**2))
+        params.setGyroscopeCovariance(np.diag(share @ imu.rate_noise**2))
         params.setIntegrationCovariance(1e-8 * three)
         params.setBiasAccCovariance(ACCEL_WALK**2 * three)
         params.setBiasOmegaCovariance(GYRO_WALK**2 * three)

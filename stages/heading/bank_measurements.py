@@ -4,6 +4,7 @@
     vertical            u = R^T e_z, by the autopilot's roll and pitch
     direction of flight |v| d = R^T v, by the drone's camera
     turn between images the gyroscope's mean rate less the mean rate by images is the gyroscope's bias
+    magnetic field      the gyroscope's bias about the vertical
 
 Rotations by both cameras: rotation_matches.py.
 
@@ -19,6 +20,7 @@ import numpy as np
 from stages.geometry.frames import Array64
 from stages.heading.inertial_bank import InertialBank
 from stages.heading.inertial_state import GYRO_BIAS, POSITION, SIZE, THETA, VELOCITY, hats
+from stages.messages import GyroBias
 
 POSITION_OUTLIERS, POSITION_DENSITY = 0.02, 1.0 / (4.0 / 3.0 * math.pi * 5.0**3)  # false returns within 5 m
 TILT_OUTLIERS, TILT_DENSITY = 0.05, 1.0
@@ -64,3 +66,11 @@ def add_turn(bank: InertialBank, rate_radps: Array64, rate_visual_radps: Array64
     H[:, :, GYRO_BIAS] = np.eye(3)
     residual = rate_radps - rate_visual_radps - bank.state.bias[:, 3:]
     bank.update(residual, H, covariance, RATE_OUTLIERS, RATE_DENSITY)
+
+
+def add_vertical_gyro_bias(bank: InertialBank, measured: GyroBias) -> None:
+    """Add a measurement of the gyroscope's bias about the vertical."""
+    H = np.zeros((len(bank.state), 1, SIZE))
+    H[:, 0, GYRO_BIAS] = measured.up_drone
+    residual = measured.bias_radps - bank.state.bias[:, 3:] @ measured.up_drone
+    bank.update(residual[:, None], H, np.array([[measured.sigma_radps**2]]), RATE_OUTLIERS, RATE_DENSITY)

@@ -18,7 +18,10 @@ from stages.odometry.drone.visual_trajectory import VisualTrajectory
 
 KEPT = 1024  # intervals: 20 s at 50 Hz
 HELD_NS = 150_000_000  # longest extrapolation with the newest interval's values
-HELD_NOISE = 0.3, 0.05  # its noise densities: specific force [m/s^2 / sqrt(Hz)], rate [rad/s / sqrt(Hz)]
+HELD_NOISE = (
+    np.full(3, 0.3),
+    np.full(3, 0.05),
+)  # its noise densities: specific force [m/s^2 / sqrt(Hz)], rate [rad/s / sqrt(Hz)]
 TURN_CHANGE_RADPS = 0.35  # one sigma, of the turn rate after the newest image, without an IMU
 CURRENT_NS = 1_000_000_000  # age of the newest interval up to which the IMU is in use
 
@@ -70,7 +73,7 @@ class ImuBuffer:
     def between(self, from_ns: int, to_ns: int) -> list[ImuIntervals | Gap]:
         """The intervals from one time to a later one, cut at both."""
         out: list[ImuIntervals | Gap] = []
-        rows: list[tuple[float, Array64, Array64, float, float]] = []
+        rows: list[tuple[float, Array64, Array64, Array64, Array64]] = []
         at_ns = from_ns
         intervals = self._intervals
         first = bisect_right(intervals, from_ns, key=lambda m: m.stamp_ns)
@@ -112,11 +115,13 @@ class ImuBuffer:
         return predict_free(state, seconds, turn.R_from_to, variance)
 
 
-def _row(m: DroneMotion, step_ns: int, force: float, rate: float) -> tuple[float, Array64, Array64, float, float]:
+def _row(
+    m: DroneMotion, step_ns: int, force: Array64, rate: Array64
+) -> tuple[float, Array64, Array64, Array64, Array64]:
     return step_ns * 1e-9, m.specific_force_drone_mps2, m.angular_velocity_drone_radps, force, rate
 
 
-def _close(out: list[ImuIntervals | Gap], rows: list[tuple[float, Array64, Array64, float, float]]) -> None:
+def _close(out: list[ImuIntervals | Gap], rows: list[tuple[float, Array64, Array64, Array64, Array64]]) -> None:
     if rows:
         step, force, rate, force_noise, rate_noise = zip(*rows, strict=True)
         out.append(

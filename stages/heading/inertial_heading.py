@@ -24,7 +24,7 @@ from stages.heading.inertial_state import POSITION, ImuIntervals, InertialState
 from stages.heading.odometry_heading import YawEvidence
 from stages.heading.rotation_matches import RotationMatches, add_matches
 from stages.kernels.geometry.so3 import log_rotation
-from stages.messages import VisualMotion
+from stages.messages import GyroBias, VisualMotion
 
 DECIDED, DECIDED_FOR_NS = 0.999, 800_000_000
 CONFIRMED = 0.99  # probability from which the matches of both cameras are taken as right
@@ -109,6 +109,11 @@ class InertialHeading:
         """Add the autopilot's vertical at the bank's time."""
         if self.bank is not None:
             measure.add_vertical(self.bank, up_drone, sigma_rad)
+
+    def add_vertical_gyro_bias(self, measured: GyroBias) -> None:
+        """Add a measurement of the gyroscope's bias about the vertical."""
+        if self.bank is not None:
+            measure.add_vertical_gyro_bias(self.bank, measured)
 
     def add_rotation(self, stamp_ns: int, matches: RotationMatches, share: float) -> float | None:
         """Add rotations by cameras, of which `share` is new evidence. Returns P that one is right; None: too old."""

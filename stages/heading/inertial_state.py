@@ -34,8 +34,8 @@ class ImuIntervals:
     step_s: Array64  # (n,)
     force_mps2: Array64  # (n, 3) specific force, drone axes
     rate_radps: Array64  # (n, 3)
-    force_noise: Array64  # (n,) [m/s^2 / sqrt(Hz)]
-    rate_noise: Array64  # (n,) [rad/s / sqrt(Hz)]
+    force_noise: Array64  # (n, 3) [m/s^2 / sqrt(Hz)]
+    rate_noise: Array64  # (n, 3) [rad/s / sqrt(Hz)]
 
     @property
     def seconds(self) -> float:

@@ -29,6 +29,7 @@ from stages.messages.drone import Candidates as Candidates
 from stages.messages.drone import Detections as Detections
 from stages.messages.drone import DroneFix as DroneFix
 from stages.messages.drone import DroneMotion as DroneMotion
+from stages.messages.drone import GyroBias as GyroBias
 from stages.messages.drone import KernelScores as KernelScores
 from stages.messages.drone import MeanShiftResult as MeanShiftResult
 from stages.messages.drone import SearchResult as SearchResult

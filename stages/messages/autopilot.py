@@ -54,12 +54,13 @@ class DroneOdometry(Message):
     independent: bool = False  # of poses that grd sent
 
 
-@message(schema=54)
+@message(schema=92)
 class DroneImu(Message):
     """One IMU sample in drone axes."""
 
     acceleration_drone_mps2: Vec3  # specific force: +g along z at rest
     angular_velocity_drone_radps: Vec3
+    magnetic_field_drone_ut: Vec3 | None = None  # [uT]; None: no magnetometer
 
 
 @message(schema=55)

@@ -156,7 +156,16 @@ class AutopilotMotion:
     odom_segment: int  # changes after each reset of the autopilot's estimator: positions of two segments do not compare
 
 
-@message(schema=75)
+@dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class GyroBias:
+    """Measured bias of the gyroscope about the vertical, up_drone . bias."""
+
+    up_drone: Vec3  # mean of the unit vectors up over the measurement
+    bias_radps: float
+    sigma_radps: float
+
+
+@message(schema=93)
 class DroneMotion(Message):
     """Measured motion of the drone over one IMU interval, from start_ns to stamp_ns.
 
@@ -167,7 +176,8 @@ class DroneMotion(Message):
     segment: int  # changes after a gap in the IMU's samples and after a restart of the autopilot
     specific_force_drone_mps2: Vec3  # mean; +g along z at rest
     angular_velocity_drone_radps: Vec3  # mean
-    specific_force_noise: float  # white-noise density [m/s^2/sqrt(Hz)] per axis, vibration included
-    angular_velocity_noise: float  # white-noise density [rad/s/sqrt(Hz)] per axis, vibration included
+    specific_force_noise: Vec3  # white-noise density of each axis [m/s^2/sqrt(Hz)], vibration included
+    angular_velocity_noise: Vec3  # white-noise density of each axis [rad/s/sqrt(Hz)], vibration included
     up_drone: Vec3 | None  # unit vector up, by the autopilot's roll and pitch (never its yaw); None: not available
     autopilot: AutopilotMotion | None  # at stamp_ns; None: not available, or not independent of our pose
+    gyro_bias: GyroBias | None = None  # by the magnetometer, over the seconds before; None: no new measurement

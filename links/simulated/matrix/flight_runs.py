@@ -18,10 +18,10 @@ from pathlib import Path
 from typing import Any
 
 from flow.config_error import ConfigError
+from flow.jobs import Workers, run_all
 from flow.link import LinkError
 from flow.ports import RunError
 from links.runs.request import RunRequest
-from links.simulated.matrix.jobs import run_all
 from links.simulated.rig.closed_loop import ClosedLoop, loop_metadata
 from links.simulated.rig.run import Simulation
 from links.simulated.rig.scenario import load_scenario
@@ -64,7 +64,7 @@ def fly_all(
     config: Path,
     seeds: range,
     folder: Path,
-    jobs: int,
+    workers: Workers,
     progress: Callable[[float, float], None],
 ) -> list[FlightResult]:
     """Fly each scenario with each seed, seed by seed. ConfigError for a scenario or the configuration."""
@@ -72,7 +72,7 @@ def fly_all(
         RunRequest(config).graph(load_scenario(scenario, sets).rig_yaml(), f"{scenario} (rig)")
     tasks = [FlightTask(s, tuple(sets), config, seed, folder) for seed, s in product(seeds, scenarios)]
     folder.mkdir(parents=True, exist_ok=True)
-    return run_all(fly, tasks, jobs, lambda shares: progress(float(sum(shares)), len(tasks)))
+    return run_all(fly, tasks, workers, lambda shares: progress(float(sum(shares)), len(tasks)))
 
 
 def fly(task: FlightTask, progress: Callable[[float], None]) -> FlightResult:

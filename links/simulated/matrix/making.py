@@ -18,6 +18,7 @@ from pathlib import Path
 
 from flow.config_error import ConfigError
 from flow.graph import Graph
+from flow.jobs import Workers, run_all
 from flow.link import TRUTH_TOPICS, LinkError
 from flow.ports import RunError
 from links.recording import RecordingReader
@@ -25,7 +26,6 @@ from links.runs.request import RunRequest
 from links.runs.run_folder import RunFolder, holds_run, replay_into
 from links.runs.truth import TruthLog
 from links.simulated.matrix.flights import Cell
-from links.simulated.matrix.jobs import run_all
 from links.simulated.matrix.matrix import Conditions, scenario_of
 from links.simulated.rig.closed_loop import ClosedLoop, loop_metadata, servo_edge
 from links.simulated.rig.run import simulate_into
@@ -98,7 +98,7 @@ def make_matrix(
     progress: Callable[[float, float], None],
     conditions: Conditions | None = None,
     results: Path | None = None,
-    jobs: int = 1,
+    workers: Workers = 1,
     images: Path | None = None,
 ) -> MatrixReport:
     """Make what is missing: `folder/<cell>-s<seed>.mcap`, `results/<cell>-s<seed>-<configuration>`.
@@ -119,7 +119,7 @@ def make_matrix(
         progress(done_s, total_s)
 
     folder.mkdir(parents=True, exist_ok=True)
-    outcomes = run_all(make_one, tasks, jobs, report)
+    outcomes = run_all(make_one, tasks, workers, report)
     return MatrixReport(
         made=sum(outcome.status is TaskStatus.MADE for outcome in outcomes),
         kept=sum(outcome.status is TaskStatus.KEPT for outcome in outcomes),

@@ -6,7 +6,7 @@ From the drone's axes at the first moment, with a = f - b_a and w = omega - b_g 
     dv <- dv + dR E(w h / 2) a h                 E = exp of a rotation vector: `a` is the mean over the interval
     dR <- dR E(w h)
 
-The noise is white with one density for each sensor. Errors are (theta, v, p): dR exp(theta), dv + v, dp + p.
+The noise is white with a density for each axis of each sensor. Errors are (theta, v, p): dR exp(theta), dv + v, dp + p.
 
 Source: Forster, Carlone, Dellaert, Scaramuzza, On-manifold preintegration (T-RO 2017), eq. 33 to 45.
 """
@@ -20,13 +20,13 @@ from stages.kernels.compiled import compiled_at_once
 from stages.kernels.geometry.so3 import exp_rotation, hat
 
 
-@compiled_at_once("(float64[::1], float64[:, ::1], float64[:, ::1], float64[::1], float64[::1], float64[:, ::1])")
+@compiled_at_once("(float64[::1], float64[:, ::1], float64[:, ::1], float64[:, ::1], float64[:, ::1], float64[:, ::1])")
 def preintegrate(
     step_s: Array64, force_mps2: Array64, rate_radps: Array64, force_noise: Array64, rate_noise: Array64, bias: Array64
 ) -> tuple[Array64, Array64, Array64, Array64, Array64]:
     """dR (3, 3), dv (3,), dp (3,), their derivatives (9, 6) by (b_a, b_g), and their covariance (9, 9).
 
-    step_s (n,), force and rate (n, 3) in drone axes, noise densities (n,); bias (2, 3): accelerometer, gyroscope.
+    step_s (n,), force, rate and their noise densities (n, 3) in drone axes; bias (2, 3): accelerometer, gyroscope.
     """
     dR, dv, dp = np.eye(3), np.zeros(3), np.zeros(3)
     J, C = np.zeros((9, 6)), np.zeros((9, 9))
@@ -48,13 +48,14 @@ def preintegrate(
         B[3:6, :3], B[6:, :3] = -h * middle, -0.5 * h * h * middle
         J[:] = A @ J + B
         C[:] = A @ C @ A.T
-        s, g = force_noise[i] ** 2, rate_noise[i] ** 2
+        scaled = middle * force_noise[i]
+        S = scaled @ scaled.T
         for k in range(3):
-            C[k, k] += g * h
-            C[3 + k, 3 + k] += s * h
-            C[6 + k, 6 + k] += s * h**3 / 3.0
-            C[3 + k, 6 + k] += 0.5 * s * h * h
-            C[6 + k, 3 + k] += 0.5 * s * h * h
+            C[k, k] += rate_noise[i, k] ** 2 * h
+        C[3:6, 3:6] += S * h
+        C[6:, 6:] += S * (h**3 / 3.0)
+        C[3:6, 6:] += S * (0.5 * h * h)
+        C[6:, 3:6] += S * (0.5 * h * h)
         dp = dp + h * dv + 0.5 * h * h * turned
         dv = dv + h * turned
         dR = dR @ exp_rotation(h * w)

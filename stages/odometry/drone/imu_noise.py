@@ -33,7 +33,7 @@ LARGEST = 9.0  # one window, relative to the average
 
 
 class NoiseDensity:
-    """Noise density per axis, of two vectors that are sampled together."""
+    """Noise density of each axis of two vectors that are sampled together."""
 
     def __init__(self, block_s: float, window_s: float, average_s: float) -> None:
         """`block_s`: least duration of a block; 0: each sample is one."""
@@ -42,16 +42,13 @@ class NoiseDensity:
         self._ended_ns: int | None = None  # end of the last block
         self._ns: deque[int] = deque(maxlen=MOST)  # middles of the blocks
         self._values: deque[Array64] = deque(maxlen=MOST)
-        self._variance: Array64 | None = None  # (2,), mean over the axes, times the duration of a block
+        self._variance: Array64 | None = None  # (2, 3), times the duration of a block
         self._windows = 0
 
     @property
-    def density(self) -> tuple[float, float] | None:
-        """Densities of the two vectors [unit/sqrt(Hz)], per axis; None before the first complete window."""
-        if self._variance is None:
-            return None
-        first, second = np.sqrt(self._variance)
-        return float(first), float(second)
+    def density(self) -> Array64 | None:
+        """Densities (2, 3) of the axes of both vectors [unit/sqrt(Hz)]; None before the first complete window."""
+        return None if self._variance is None else np.sqrt(self._variance)
 
     def new_segment(self) -> None:
         """Forget the samples, not the noise: after a gap no curve connects them."""
@@ -81,7 +78,7 @@ class NoiseDensity:
         if len(self._ns) < LEAST or (len(self._ns) < MOST and span_ns + block_s * 1e9 < self._window_ns):
             return
         mean_s = span_ns * 1e-9 / (len(self._ns) - 1)
-        new = mean_s * residual_variance(np.array(self._ns), np.array(self._values)).reshape(2, 3).mean(axis=1)
+        new = mean_s * residual_variance(np.array(self._ns), np.array(self._values)).reshape(2, 3)
         self._windows += 1
         if self._variance is None:
             self._variance = new

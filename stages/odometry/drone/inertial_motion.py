@@ -4,7 +4,7 @@ The one stage that reads the drone's motion from its autopilot: gaps, restarts a
 else reads its DroneMotion. The mean over an interval is that of its two samples (trapezoid). A single false sample is
 left out (imu_outliers.py). A gap, and a clock that was set back, end a segment. Specific force, rate and the vertical
 are the drone's own measurements; the autopilot's position, velocity and yaw are added only while they cannot contain a
-pose that grd sent (`independent`).
+pose that grd sent (`independent`). Of the magnetometer only the bias of the gyro is used (magnetic_gyro_bias.py).
 
 The noise is a density, estimated from the samples (imu_noise.py): with a density d the variance of the velocity grows
 by d^2 per second. Until it is known, samples with white noise s at intervals of dt have the density s sqrt(dt).
@@ -20,13 +20,16 @@ from collections import Counter
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
+import numpy as np
 from pydantic import Field
 
 from flow.stage import Settings, Stage
+from stages.geometry.frames import Array64
 from stages.messages import DroneAttitude, DroneImu, DroneLocalPosition, DroneMotion, DroneOdometry, DroneTilt
 from stages.odometry.drone.autopilot_estimate import AutopilotEstimate
 from stages.odometry.drone.imu_noise import NoiseDensity
 from stages.odometry.drone.imu_outliers import FalseSamples
+from stages.odometry.drone.magnetic_gyro_bias import MagneticGyroBias
 
 CLOCK_SET_NS = 1_000_000_000  # a stamp that is earlier by more: the clock was set; by less: late or repeated
 
@@ -59,6 +62,7 @@ class InertialMotion(Stage[InertialMotionSettings]):
             NoiseDensity(s.noise_block_s, 2 * s.noise_window_s, s.noise_average_s),
         )
         self._false = FalseSamples()
+        self._magnetic = MagneticGyroBias()
         self._last: DroneImu | None = None
         self._segment = 0
         self._counts: Counter[str] = Counter()
@@ -104,6 +108,7 @@ class InertialMotion(Stage[InertialMotionSettings]):
         self._add(imu)
         self._autopilot.on_imu(force, rate)
         force_noise, rate_noise = self._noise_densities(dt_ns * 1e-9)
+        up = self._autopilot.up_drone(imu.stamp_ns)
         return DroneMotion(
             stamp_ns=imu.stamp_ns,
             start_ns=last.stamp_ns,
@@ -112,14 +117,16 @@ class InertialMotion(Stage[InertialMotionSettings]):
             angular_velocity_drone_radps=rate,
             specific_force_noise=force_noise,
             angular_velocity_noise=rate_noise,
-            up_drone=self._autopilot.up_drone(imu.stamp_ns),
+            up_drone=up,
             autopilot=self._autopilot.at(imu.stamp_ns),
+            gyro_bias=self._magnetic.add(dt_ns * 1e-9, rate, imu.magnetic_field_drone_ut, up),
         )
 
     def _begin(self, imu: DroneImu) -> None:
         for noise in self._noise:
             noise.new_segment()
         self._false.new_segment()
+        self._magnetic.restart()
         self._add_to_outlier_check(imu)  # too few samples to be false
         self._add(imu)
 
@@ -132,10 +139,10 @@ class InertialMotion(Stage[InertialMotionSettings]):
             noise.add(imu.stamp_ns, imu.acceleration_drone_mps2, imu.angular_velocity_drone_radps)
         self._last = imu
 
-    def _noise_densities(self, dt_s: float) -> tuple[float, float]:
-        """Noise densities of specific force and rate over an interval."""
-        s, root = self.settings, math.sqrt(dt_s)
+    def _noise_densities(self, dt_s: float) -> Array64:
+        """Noise densities (2, 3) of specific force and rate over an interval."""
+        s = self.settings
         known = [noise.density for noise in self._noise if noise.density is not None]
-        known = known or [(s.initial_force_mps2 * root, s.initial_rate_radps * root)]
-        force, rate = (max(part) for part in zip(*known, strict=True))
-        return max(force, s.least_force_noise), max(rate, s.least_rate_noise)
+        if not known:
+            known = [np.outer([s.initial_force_mps2, s.initial_rate_radps], np.full(3, math.sqrt(dt_s)))]
+        return np.maximum.reduce([*known, np.outer([s.least_force_noise, s.least_rate_noise], np.ones(3))])

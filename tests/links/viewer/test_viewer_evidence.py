@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from stages.messages import (
     AutopilotMotion,
     Candidates,
     DroneMotion,
+    GyroBias,
     ServoGoal,
     SweptPulses,
     TrackingState,
@@ -363,16 +365,19 @@ def test_the_drones_motion_is_curves_of_force_rate_noise_and_segments():
         segment=2,
         specific_force_drone_mps2=np.array([1.0, 2.0, 9.8]),
         angular_velocity_drone_radps=np.radians([10.0, 20.0, 30.0]),
-        specific_force_noise=0.07,
-        angular_velocity_noise=np.radians(0.1),
+        specific_force_noise=np.full(3, 0.07),
+        angular_velocity_noise=np.full(3, np.radians(0.1)),
         up_drone=None,
         autopilot=estimate,
+        gyro_bias=GyroBias(up_drone=np.array([0.0, 0.0, 1.0]), bias_radps=math.radians(0.2), sigma_radps=0.001),
     )
     values = {path: entity.values.tolist() for path, entity in drawn(motion, "drone_motion/drone_motion").items()}
     path = "plots/other/drone_motion/drone_motion"
     assert values == {
         f"{path}/force": [1.0, 2.0, 9.8],
         f"{path}/rate": pytest.approx([10.0, 20.0, 30.0]),
-        f"{path}/noise": pytest.approx([0.07, 0.1]),
+        f"{path}/force noise": [0.07] * 3,
+        f"{path}/rate noise": pytest.approx([0.1] * 3),
+        f"{path}/gyro bias": [pytest.approx(0.2)],
         f"{path}/segments": [2, 4],
     }

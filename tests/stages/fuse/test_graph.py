@@ -249,8 +249,8 @@ def spinning(rate_radps, late_s, yaw_off_rad, sigma_rad):
                 segment=0,
                 specific_force_drone_mps2=-GRAVITY_MPS2,
                 angular_velocity_drone_radps=np.array([0.0, 0.0, rate_radps]),
-                specific_force_noise=0.05,
-                angular_velocity_noise=1e-3,
+                specific_force_noise=np.full(3, 0.05),
+                angular_velocity_noise=np.full(3, 1e-3),
                 up_drone=None,
                 autopilot=None,
             )

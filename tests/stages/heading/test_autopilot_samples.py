@@ -22,8 +22,8 @@ def motion(at_ms, up=(0.0, 0.0, 1.0), own=True, segment=3):
         segment=0,
         specific_force_drone_mps2=np.array([0.0, 0.0, 9.8]),
         angular_velocity_drone_radps=np.zeros(3),
-        specific_force_noise=0.01,
-        angular_velocity_noise=0.001,
+        specific_force_noise=np.full(3, 0.01),
+        angular_velocity_noise=np.full(3, 0.001),
         up_drone=None if up is None else np.array(up),
         autopilot=odometry if own else None,
     )

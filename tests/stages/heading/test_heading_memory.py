@@ -30,8 +30,8 @@ def remembered(rate_radps=0.0, until_s=12.0, yaw_rad=0.5, sigma_rad=0.02):
                 segment=0,
                 specific_force_drone_mps2=-GRAVITY_MPS2,
                 angular_velocity_drone_radps=np.array([0.0, 0.0, rate_radps]),
-                specific_force_noise=0.02,
-                angular_velocity_noise=0.002,
+                specific_force_noise=np.full(3, 0.02),
+                angular_velocity_noise=np.full(3, 0.002),
                 up_drone=None,
                 autopilot=None,
             )

@@ -8,10 +8,11 @@ import numpy as np
 
 from stages.geometry.frames import rotation_z
 from stages.heading import bank_measurements as measure
-from stages.heading.inertial_bank import NEAR_RAD, InertialBank, level, moments, start
+from stages.heading.inertial_bank import NEAR_RAD, START_GYRO_BIAS, InertialBank, level, moments, start
 from stages.heading.inertial_state import GRAVITY_MPS2, ImuIntervals, InertialState, exp_rotations, predict
 from stages.kernels.geometry.so3 import exp_rotation, log_rotation
 from stages.kernels.heading.preintegration import preintegrate
+from stages.messages import GyroBias
 
 UP = np.array([0.0, 0.0, 1.0])
 REST = -GRAVITY_MPS2
@@ -19,7 +20,11 @@ REST = -GRAVITY_MPS2
 
 def intervals(n=10, step_s=0.02, force=REST, rate=(0.0, 0.0, 0.0)):
     return ImuIntervals(
-        np.full(n, step_s), np.tile(force, (n, 1)), np.tile(np.array(rate), (n, 1)), np.full(n, 0.04), np.full(n, 1e-3)
+        np.full(n, step_s),
+        np.tile(force, (n, 1)),
+        np.tile(np.array(rate), (n, 1)),
+        np.full((n, 3), 0.04),
+        np.full((n, 3), 1e-3),
     )
 
 
@@ -46,7 +51,7 @@ def test_a_forward_force_accelerates_along_the_hypothesis_s_own_yaw():
 def test_derivatives_by_the_biases_are_those_of_finite_differences():
     rng = np.random.default_rng(1)
     step, force, rate = np.full(8, 0.02), rng.normal(0, 1, (8, 3)) + REST, rng.normal(0, 0.7, (8, 3))
-    noise = np.zeros(8)
+    noise = np.zeros((8, 3))
     base = preintegrate(step, force, rate, noise, noise, np.zeros((2, 3)))
     for k in range(6):
         bias = np.zeros(6)
@@ -71,6 +76,26 @@ def test_the_predicted_covariance_is_that_of_sampled_states():
     )
     ratio = np.diag(one_of_all.covariance[0])[:9] / np.diag(after.covariance[0])[:9]
     assert np.all(np.abs(ratio - 1.0) < 0.1)
+
+
+def test_the_noise_of_each_axis_is_turned_with_the_drone():
+    """Noise of the force along the drone's x axis alone, at a yaw of 90 deg: the velocity's error is along y."""
+    imu, n = intervals(n=10, step_s=0.02), 10
+    noise = np.tile([0.2, 0.0, 0.0], (n, 1))
+    state = InertialState(
+        rotation_z(0.5 * math.pi)[None], np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((1, 6)), np.zeros((1, 15, 15))
+    )
+    moved = predict(state, ImuIntervals(imu.step_s, imu.force_mps2, imu.rate_radps, noise, 0.0 * noise), np.ones(1))
+    assert np.allclose(np.diag(moved.covariance[0])[6:9], [0.0, 0.2**2 * 0.2, 0.0], atol=1e-12)
+
+
+def test_a_measured_gyro_bias_about_the_vertical_leaves_the_other_axes_open():
+    bank = start(np.zeros(3), 0.01 * np.eye(3), None, UP)
+    measure.add_vertical_gyro_bias(bank, GyroBias(up_drone=UP, bias_radps=0.003, sigma_radps=1e-4))
+    assert np.allclose(bank.state.bias[:, 3:], [0.0, 0.0, 0.003], atol=2e-5)
+    sigma = np.sqrt(np.diagonal(bank.state.covariance[:, 12:, 12:], axis1=1, axis2=2))
+    assert np.allclose(sigma[:, 2], 1e-4, rtol=2.0)  # larger by the outlier share
+    assert np.allclose(sigma[:, :2], START_GYRO_BIAS)
 
 
 def test_hypotheses_surround_the_circle_and_are_level():

@@ -66,9 +66,15 @@ class Downlink:
         return found
 
     def send_due(
-        self, now_ns: int, tick: FlownTick, ekf: Estimators, device_ns_of: Callable[[int], int], heartbeat: Any
+        self,
+        now_ns: int,
+        tick: FlownTick,
+        field_ut: Array64,
+        ekf: Estimators,
+        device_ns_of: Callable[[int], int],
+        heartbeat: Any,
     ) -> None:
-        """Send what is due in a tick, in the middle of each step of the main loop."""
+        """Send what is due in a tick, in the middle of each step of the main loop; field_ut: magnetic field (3,)."""
         reported = ekf.reported
         other = None if reported is ekf.primary else reported.lane.output()[0:10]
         for step in range(STEPS):
@@ -78,7 +84,7 @@ class Downlink:
             for message in self.streams.due(device_ns):
                 if message == streams.HEARTBEAT:
                     self._waiting.append(heartbeat)
-                elif (built := _message(message, device_ns, ekf, estimate, tick.samples[step])) is not None:
+                elif (built := _message(message, device_ns, ekf, estimate, tick.samples[step], field_ut)) is not None:
                     self._waiting.append(built)
             while self._waiting:
                 frame = packed(self._waiting.popleft(), self._mav)
@@ -88,7 +94,9 @@ class Downlink:
                     self._records.append((sent_ns, record))
 
 
-def _message(message: int, device_ns: int, ekf: Estimators, estimate: Array64, sample: Array64) -> Any:
+def _message(
+    message: int, device_ns: int, ekf: Estimators, estimate: Array64, sample: Array64, field_ut: Array64
+) -> Any:
     """One message by its id; None: not known now. EKF3 reports no position in constant position mode."""
     core = ekf.reported
     gyro = sample[0:3] - core.lane.x[10:13]
@@ -101,9 +109,9 @@ def _message(message: int, device_ns: int, ekf: Estimators, estimate: Array64, s
         resets = core.lane.reset_count
         return telemetry.odometry(device_ns, estimate, gyro, core.lane.P, resets) if known else None
     if message == streams.RAW_IMU:
-        return telemetry.raw_imu(device_ns, sample)
+        return telemetry.raw_imu(device_ns, sample, field_ut)
     if message == streams.SCALED_IMU:
-        return telemetry.scaled_imu(device_ns, sample)
+        return telemetry.scaled_imu(device_ns, sample, field_ut)
     if message == streams.HIGHRES_IMU:
-        return telemetry.highres_imu(device_ns, sample)
+        return telemetry.highres_imu(device_ns, sample, field_ut)
     return ekf.report(device_ns)

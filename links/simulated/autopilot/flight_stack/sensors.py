@@ -1,7 +1,7 @@
 """GPS, compass and barometer of the drone, in the autopilot's north-aligned frame odom.
 
     GPS       position + Gauss-Markov bias + white noise, velocity + white noise, known `delay_s` after it was true
-    compass   yaw + offset + constant bias + white noise
+    compass   heading by the magnetometer (magnetometer.py)
     barometer height + Gauss-Markov bias + white noise
 
 Source: ours; orders of magnitude of consumer parts (u-blox M8, MS5611).
@@ -9,13 +9,14 @@ Source: ours; orders of magnitude of consumer parts (u-blox M8, MS5611).
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
 
+from links.simulated.autopilot.flight_stack.magnetometer import Magnetometer
 from links.simulated.autopilot.flight_stack.settings import FlightStackSettings
+from links.simulated.autopilot.flight_stack.wander import Wander
 from stages.geometry.frames import Array64
 
 NS = 1_000_000_000
@@ -31,24 +32,6 @@ class GpsFix:
     velocity_mps: Array64
 
 
-class Wander:
-    """A first-order Gauss-Markov process, stationary from the start."""
-
-    def __init__(self, sigma: Array64, time_s: float, rng: np.random.Generator) -> None:
-        self._sigma, self._time_s, self._rng = sigma, time_s, rng
-        self._value = sigma * rng.standard_normal(len(sigma))
-        self._at_s: float | None = None
-
-    def at(self, time_s: float) -> Array64:
-        """The value at a time; times must not decrease."""
-        if self._at_s is not None:
-            keep = math.exp(-(time_s - self._at_s) / self._time_s)
-            white = self._rng.standard_normal(len(self._sigma))
-            self._value = keep * self._value + self._sigma * math.sqrt(1 - keep * keep) * white
-        self._at_s = time_s
-        return self._value
-
-
 class Sensors:
     """Call `measure` once per tick with the true state; it returns what the autopilot receives now."""
 
@@ -60,16 +43,23 @@ class Sensors:
         self._gps_bias = Wander(gps.bias_m * np.array([1.0, 1.0, 1.5]), gps.bias_time_s, rng)
         self._baro_bias = Wander(np.array([baro.bias_m]), baro.bias_time_s, rng)
         self._baro_first = float(self._baro_bias.at(0.0)[0])  # calibrated at boot: height 0
-        self.yaw_bias_rad = math.radians(
-            settings.compass.offset_deg + settings.compass.bias_deg * rng.standard_normal()
-        )
+        self.magnetometer = Magnetometer(settings.compass, seed)
         self._gps_waiting: deque[tuple[float, GpsFix]] = deque()
         self._next_s = {"gps": 0.0, "compass": 0.0, "baro": 0.0}
 
     def measure(
-        self, time_s: float, device_ns: int, xyz_m: Array64, velocity_mps: Array64, yaw_rad: float
+        self,
+        time_s: float,
+        device_ns: int,
+        xyz_m: Array64,
+        velocity_mps: Array64,
+        R_odom_drone: Array64,
+        thrust_g: float,
     ) -> tuple[list[GpsFix], list[float], list[float]]:
-        """GPS fixes, compass yaws [rad] and heights [m] that arrive at a time. The state is that of now, frame odom."""
+        """GPS fixes, compass yaws [rad] and heights [m] that arrive at a time. The state is that of now, frame odom.
+
+        thrust_g: thrust over weight.
+        """
         s, rng = self._settings, self._rng
         if s.gps_available and self._due("gps", time_s, s.gps.rate_hz):
             xyz = xyz_m + self._gps_bias.at(time_s) + s.gps.white_m * rng.standard_normal(3)
@@ -79,9 +69,10 @@ class Sensors:
         fixes: list[GpsFix] = []
         while self._gps_waiting and self._gps_waiting[0][0] <= time_s:
             fixes.append(self._gps_waiting.popleft()[1])
+        self.magnetometer.sample(time_s, R_odom_drone, thrust_g)
         yaws: list[float] = []
         if self._due("compass", time_s, COMPASS_HZ):
-            yaws.append(yaw_rad + self.yaw_bias_rad + math.radians(s.compass.white_deg) * rng.standard_normal())
+            yaws.append(self.magnetometer.heading_rad(R_odom_drone))
         heights: list[float] = []
         if self._due("baro", time_s, BARO_HZ):
             bias = float(self._baro_bias.at(time_s)[0]) - self._baro_first

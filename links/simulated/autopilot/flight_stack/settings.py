@@ -50,11 +50,14 @@ class GpsSettings(_StackSettings):
 
 
 class CompassSettings(_StackSettings):
-    """Compass, as a heading: offset (a wrong calibration or a disturbance), slow bias and white noise."""
+    """Magnetometer; sigmas of each axis."""
 
-    offset_deg: float = Field(default=0.0, ge=-180, le=180)
-    bias_deg: float = Field(default=2.0, ge=0)  # one sigma, constant in a run
-    white_deg: float = Field(default=1.0, ge=0)
+    offset_deg: float = Field(default=0.0, ge=-180, le=180)  # of the heading: wrong mounting or declination
+    hard_iron_ut: float = Field(default=2.0, ge=0)  # constant in drone axes, left by the calibration
+    motor_ut: float = Field(default=2.0, ge=0)  # in drone axes, by the current of hovering; grows with thrust
+    slow_ut: float = Field(default=0.5, ge=0)  # slow changes: steel nearby, temperature
+    slow_s: float = Field(default=60.0, gt=0)  # their time constant
+    white_ut: float = Field(default=0.4, ge=0)
 
 
 class BaroSettings(_StackSettings):

@@ -39,8 +39,10 @@ from links.simulated.autopilot.flight_stack.quadrotor import TICK_S, Quadrotor
 from links.simulated.autopilot.flight_stack.sensors import Sensors
 from links.simulated.autopilot.flight_stack.settings import TakeOff, UseSources
 from links.simulated.autopilot.radio import Radio
+from links.simulated.kernels.airframe import QUATERNION, THRUST
+from links.simulated.kernels.motion import GRAVITY_MPS2
 from links.simulated.world.path import Path
-from stages.geometry.frames import Array64
+from stages.geometry.frames import Array64, heading_rad, rotation_from_quaternion_xyzw, rotation_z
 
 mavlink: Any = ardupilotmega
 NS = 1_000_000_000
@@ -84,8 +86,8 @@ class FlightStack:
         self._map = tuple(part[0] for part in (vehicle.at(np.zeros(1))[0], vehicle.at(np.zeros(1))[3]))
         self.quadrotor = Quadrotor(s, home, float(yaw), ground_m, duration_s, seed)
         self.motion = self.quadrotor.motion
-        self._sensors = Sensors(s, seed)
-        self.ekf = Estimators(s, self._true_yaw() + self._sensors.yaw_bias_rad, seed)
+        self._sensors, self._tick = Sensors(s, seed), 0
+        self.ekf = Estimators(s, self._compass_yaw(), seed)
         self._drift_m = drift_m or (lambda time_s: np.zeros(3))
         self._guidance = Guidance(path, vehicle, FlightTarget(np.zeros(3), yaw_rad=self._true_yaw()), self._drift_m)
         self._controller, self._check = PositionController(), EkfCheck()
@@ -95,7 +97,6 @@ class FlightStack:
         self._climbing_to: float | None = None
         self._uplink = Radio(settings.uplink, start_ns, np.random.default_rng([seed, 32]))
         self._received: deque[tuple[int, bytes]] = deque()
-        self._tick = 0
         self._boot_ns = start_ns - round(NS * settings.boot_s)
         self._silent_until_ns = 0
         self._reboots, self._jumps = deque(sorted(s.reboot_s)), deque(sorted(s.estimate_resets_m))
@@ -181,7 +182,8 @@ class FlightStack:
             device_ns,
             rotate(state[0:3] - self._home, self._world_yaw),
             rotate(state[3:6], self._world_yaw),
-            self._true_yaw(),
+            self._R_odom_drone(),
+            float(state[THRUST]) / GRAVITY_MPS2,
         )
         self.ekf.write(device_ns, *measured)
         self.ekf.in_flight = self.armed and not self.quadrotor.grounded
@@ -199,7 +201,9 @@ class FlightStack:
         tick = self.quadrotor.fly(estimate, command)
         self.ekf.step(self.device_ns(now_ns + TICK_NS), tick.moved)
         if alive:
-            self._downlink.send_due(now_ns, tick, self.ekf, self.device_ns, self._heartbeat())
+            self._downlink.send_due(
+                now_ns, tick, self._sensors.magnetometer.field_ut, self.ekf, self.device_ns, self._heartbeat()
+            )
 
     def _command(self, time_s: float, estimate: Array64) -> Array64:
         """(6,) for the airframe."""
@@ -312,7 +316,7 @@ class FlightStack:
         self._boot_ns, self._silent_until_ns = now_ns, now_ns + round(BOOT_S * NS)
         self._downlink.restart()
         self.origin = None
-        self.ekf.restart(self._true_yaw() + self._sensors.yaw_bias_rad)
+        self.ekf.restart(self._compass_yaw())
         self._controller.reset()
         self._check = EkfCheck()
 
@@ -326,10 +330,20 @@ class FlightStack:
         state = mavlink.MAV_STATE_CRITICAL if critical else flying
         return mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_QUADROTOR, autopilot, base, self.mode, state, 3)
 
+    def _R_odom_drone(self) -> Array64:
+        """True attitude in the north-aligned frame."""
+        x, y, z, w = self.quadrotor.state[QUATERNION]
+        return rotation_z(self._world_yaw) @ rotation_from_quaternion_xyzw((x, y, z, w))
+
     def _true_yaw(self) -> float:
-        """True yaw in the north-aligned frame, for the compass."""
-        x, y, z, w = self.quadrotor.state[6:10]
-        return math.atan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z)) + self._world_yaw
+        """True yaw in the north-aligned frame."""
+        return heading_rad(self._R_odom_drone())
+
+    def _compass_yaw(self) -> float:
+        """Yaw in the north-aligned frame by the compass, at boot."""
+        R = self._R_odom_drone()
+        self._sensors.magnetometer.sample(self._tick * TICK_S, R, float(self.quadrotor.state[THRUST]) / GRAVITY_MPS2)
+        return self._sensors.magnetometer.heading_rad(R)
 
     def _note(self, what: str) -> None:
         self.events.append((self._tick * TICK_S, what))

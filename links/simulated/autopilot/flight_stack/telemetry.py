@@ -62,20 +62,25 @@ def odometry(device_ns: int, estimate: Array64, gyro: Array64, P: Array64, reset
     )
 
 
-def raw_imu(device_ns: int, sample: Array64) -> Any:
-    """RAW_IMU of a sample (6,): gyro, accelerometer, body axes."""
-    return mavlink.MAVLink_raw_imu_message(device_ns // US, *imu_counts(sample), 0, 0, 0)
+def raw_imu(device_ns: int, sample: Array64, field_ut: Array64) -> Any:
+    """RAW_IMU of a sample (6,): gyro, accelerometer, body axes; magnetic field (3,)."""
+    return mavlink.MAVLink_raw_imu_message(device_ns // US, *imu_counts(sample), *field_counts(field_ut))
 
 
-def scaled_imu(device_ns: int, sample: Array64) -> Any:
+def scaled_imu(device_ns: int, sample: Array64, field_ut: Array64) -> Any:
     """SCALED_IMU."""
-    return mavlink.MAVLink_scaled_imu_message(device_ns // MS, *imu_counts(sample), 0, 0, 0)
+    return mavlink.MAVLink_scaled_imu_message(device_ns // MS, *imu_counts(sample), *field_counts(field_ut))
 
 
-def highres_imu(device_ns: int, sample: Array64) -> Any:
-    """HIGHRES_IMU (PX4), SI units."""
-    values = [*flip_yz(sample[3:6]).tolist(), *flip_yz(sample[0:3]).tolist()]
-    return mavlink.MAVLink_highres_imu_message(device_ns // US, *values, *[0.0] * 7, 0b111111)
+def highres_imu(device_ns: int, sample: Array64, field_ut: Array64) -> Any:
+    """HIGHRES_IMU (PX4), SI units and gauss."""
+    values = [*flip_yz(sample[3:6]).tolist(), *flip_yz(sample[0:3]).tolist(), *flip_yz(0.01 * field_ut).tolist()]
+    return mavlink.MAVLink_highres_imu_message(device_ns // US, *values, *[0.0] * 4, 0b111_111_111)
+
+
+def field_counts(field_ut: Array64) -> list[int]:
+    """mgauss as integers, FRD axes."""
+    return np.rint(10.0 * flip_yz(field_ut)).astype(int).tolist()
 
 
 def imu_counts(sample: Array64) -> list[int]:

@@ -118,7 +118,7 @@ def test_all_velocities_are_fused_with_bit_0_of_the_source_options(options: int)
 
 def test_the_yaw_is_that_of_the_source_in_use() -> None:
     """On the compass (30 deg wrong) the estimate is 30 deg off the true yaw by north; on poses it is that of map."""
-    host = Host(12.0, compass={"offset_deg": 30, "bias_deg": 0.0})
+    host = Host(12.0, compass={"offset_deg": 30, "hard_iron_ut": 0.0, "motor_ut": 0.0, "slow_ut": 0.0})
     host.run(3.9)
     assert yaw_error_deg(host, north=True) == pytest.approx(30.0, abs=6.0)  # the GPS pulls it a little
     host.run(12.0)

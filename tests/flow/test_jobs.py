@@ -13,16 +13,16 @@ from pathlib import Path
 
 import pytest
 
+from flow.jobs import run_all
 from flow.link import LinkError
-from links.simulated.matrix.jobs import run_all
 
-ROOT = Path(__file__).resolve().parents[4]
+ROOT = Path(__file__).resolve().parents[2]
 PATIENCE_S = 60.0
 
 SLOW = """\
 import os, signal, sys, time
 from pathlib import Path
-from links.simulated.matrix.jobs import run_all
+from flow.jobs import run_all
 
 def slow(name, report):
     here = Path(sys.argv[1])
@@ -108,9 +108,32 @@ def test_an_exception_of_a_task_stops_all_and_is_raised(jobs: int) -> None:
         run_all(refuse, [0, 1, 2], jobs, lambda shares: None)
 
 
-def test_a_killed_process_is_an_error_that_states_what_to_do() -> None:
-    with pytest.raises(LinkError, match="was killed: if memory is short, use fewer --jobs"):
+def killed_once(folder: str, report: Callable[[float], None]) -> int:
+    """Kills its own process the first time."""
+    first = Path(folder) / "began"
+    if not first.exists():
+        first.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return os.getpid()
+
+
+def test_a_task_that_always_kills_its_worker_is_an_error_that_states_what_to_do() -> None:
+    with pytest.raises(LinkError, match="3 workers were lost with the same task: if memory is short, use fewer --jobs"):
         run_all(vanish, [0, 1], 2, lambda shares: None)
+
+
+def test_a_task_of_a_lost_worker_runs_again(tmp_path: Path) -> None:
+    folders = [tmp_path / "a", tmp_path / "b"]
+    for folder in folders:
+        folder.mkdir()
+    (folders[1] / "began").touch()  # is not killed
+    assert len(run_all(killed_once, [str(folder) for folder in folders], 2, lambda shares: None)) == 2
+
+
+def test_an_unknown_scheduler_is_an_error_that_states_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("flow.jobs.CONNECT_S", 1)
+    with pytest.raises(LinkError, match=r"no scheduler at tcp://127.0.0.1:9: .*start one: dask scheduler"):
+        run_all(square, [1], "tcp://127.0.0.1:9", lambda shares: None)
 
 
 def test_no_tasks_give_no_results() -> None:

@@ -128,8 +128,9 @@ def candidate_outcomes(e: Evaluation) -> pd.DataFrame:
         covered, xyz_m = position_at(path, rows.stamp_ns.to_numpy(), e.limits)
         known &= covered
         is_drone |= covered & (np.linalg.norm(rows[[*XYZ]] - xyz_m, axis=1) < e.limits.false_m)
-    rows = rows.assign(is_drone=is_drone, range_m=np.linalg.norm(rows[[*XYZ]], axis=1))
-    return rows.loc[known | is_drone, ["candidate", "probability", "telemetry", "range_m", "is_drone"]]
+    range_m = np.linalg.norm(rows[[*XYZ]], axis=1)
+    columns = {"candidate": rows.candidate, "probability": rows.probability, "telemetry": rows.telemetry}
+    return pd.DataFrame(columns | {"range_m": range_m, "is_drone": is_drone})[known | is_drone]
 
 
 def probability_outcomes(e: Evaluation) -> pd.DataFrame:

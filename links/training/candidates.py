@@ -112,11 +112,12 @@ def _read(folder: Path, index: int, thin: bool) -> pd.DataFrame:
     if absent := [name for name in NAMES if name not in frame.columns]:
         raise LinkError(f"{file}: no feature {', '.join(absent)}; replay the recording with this version of grd")
     for name in NAMES:
-        values = pd.to_numeric(frame[name], errors="coerce").to_numpy(dtype=np.float64)
-        wrong = np.isinf(values) | (np.isnan(values) & (frame[name].notna() | (name in REQUIRED)).to_numpy())
+        values = np.asarray(pd.to_numeric(frame[name], errors="coerce"), dtype=np.float64)
+        empty = np.asarray(frame[name].isna())
+        wrong = np.isinf(values) | (np.isnan(values) & (~empty | (name in REQUIRED)))
         if wrong.any():
             row = int(wrong.argmax())
-            text = "missing" if frame[name].isna()[row] else f"'{frame[name][row]}', not a finite number"
+            text = "missing" if empty[row] else f"'{frame[name].iloc[row]}', not a finite number"
             raise LinkError(f"{file}:{row + 2}: {name} is {text}")
     frame["stamp_ns"] = [int(s) * 10**9 + int(f.ljust(9, "0")) for s, f in (t.split(".") for t in frame.stamp_s)]
     known, frame["is_drone"] = _labels(folder, frame)

@@ -11,7 +11,7 @@ Bar-Shalom, Daum, Huang, "The Probabilistic Data Association Filter", IEEE CSM 2
 from __future__ import annotations
 
 import datetime
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from stonesoup.functions import gm_reduce_single
@@ -48,7 +48,7 @@ class ImmPdaf:
         self._settings, self.stamp_ns = settings, stamp_ns
         self._measurement = LinearGaussian(ndim_state=6, mapping=POSITION, noise_covar=np.eye(3) * settings.sigma_m**2)
         self._updater = KalmanUpdater(self._measurement)
-        self._associate = [_hypothesiser(noise, self._updater, settings) for noise in settings.noise_mps]
+        self._associate: list[Any] = [_hypothesiser(noise, self._updater, settings) for noise in settings.noise_mps]
         mean = np.zeros(6)
         mean[POSITION] = xyz_m
         covariance = np.diag([settings.sigma_m**2, settings.start_speed_mps**2] * 3)
@@ -68,7 +68,7 @@ class ImmPdaf:
         for j, hypothesiser in enumerate(self._associate):
             hypotheses = hypothesiser.hypothesise(mixed[j], found, when)
             weights = np.array([float(hypothesis.probability) for hypothesis in hypotheses])
-            states = [self._updater.update(h) if h else h.prediction for h in hypotheses]
+            states: list[Any] = [self._updater.update(h) if h else h.prediction for h in hypotheses]
             self._states[j] = _merged(states, weights / weights.sum())
             likelihood[j] = weights.sum()
             gated = max(gated, len(weights) - 1)

@@ -22,6 +22,7 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 from sklearn.cluster import DBSCAN
 
@@ -32,6 +33,7 @@ from stages.geometry.trajectory import VehicleTrajectory
 from stages.messages import DroneFix, SweptPoints, TrackingState, TrackState, VehicleMotion
 from stages.track.imm_pdaf import ImmPdaf, ImmSettings
 
+Stamps = NDArray[np.int64]
 TENTATIVE_NS = 1_000_000_000  # a tentative track ends this long after its last measurement
 BACKGROUND_NS = 3_000_000_000  # one sweep of the turntable
 
@@ -57,7 +59,7 @@ class _State:
     trail: VehicleTrajectory = field(default_factory=VehicleTrajectory)
     background: LargeObjectMap = field(default_factory=LargeObjectMap)
     tracks: list[_Track] = field(default_factory=lambda: list[_Track]())
-    points: list[tuple[Array64, Array64]] = field(default_factory=lambda: list[tuple[Array64, Array64]]())
+    points: list[tuple[Array64, Stamps]] = field(default_factory=lambda: list[tuple[Array64, Stamps]]())
     frame_end_ns: int | None = None
     number: int = 0  # of the newest track
     published: int = 0  # number of the published track; 0: none
@@ -163,7 +165,7 @@ class ImmPdafTrack(Stage[ImmPdafTrackSettings]):
         """The small clusters of the frame, which is then empty."""
         now, settings = self._now, self.settings
         parts, now.points = now.points, []
-        xyz_m, stamps_ns = (np.concatenate([part[k] for part in parts]) for k in range(2))
+        xyz_m, stamps_ns = np.concatenate([xyz for xyz, _ in parts]), np.concatenate([stamps for _, stamps in parts])
         if not len(xyz_m):
             return []
         labels = DBSCAN(eps=settings.eps_m, min_samples=settings.min_points).fit(xyz_m).labels_

@@ -1,4 +1,4 @@
-"""The folder in which numba caches compiled code: its name depends on the source of all compiled functions.
+"""The folder in which compiled code is cached: its name depends on the source of all compiled functions.
 
 Numba checks only a function's own file to detect a stale cache, not the files of the functions that are compiled into
 it. A folder name that depends on every file makes numba compile everything again when any of them changes.
@@ -13,8 +13,6 @@ import os
 import tempfile
 from collections.abc import Iterable
 from pathlib import Path
-
-from numba.core import config
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -41,8 +39,6 @@ def cache_folder(name: str) -> Path:
     return folder / name
 
 
-def keep_compiled(folders: Iterable[str]) -> Path:
-    """Make numba cache in the folder for the source of `folders` (relative to the project's root). That folder."""
-    folder = cache_folder(cache_name(ROOT / name for name in folders))
-    config.CACHE_DIR = str(folder)  # pyright: ignore
-    return folder
+def folder_of(folders: Iterable[str]) -> Path:
+    """The cache folder for the source of `folders`, relative to the project's root."""
+    return cache_folder(cache_name(ROOT / name for name in folders))

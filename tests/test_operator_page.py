@@ -19,8 +19,8 @@ from links.mavlink.poses.gate import RejectReason as GateRejectReason
 from links.recording import Recorder
 from links.recording.writer import CLOSE_TIMEOUT_S
 from stages.messages import BranchState, PoseState, TrackingState
+from tests.command import unit_file
 from tests.links.fault_bounds import BOUNDS, FIRST_POSE_S, FIRST_POSITION_S, KILLED, MAX_RECORDING_LOSS_S, REST_S
-from tests.unit_file import unit_file
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = (ROOT / "deploy" / "OPERATOR.md").read_text(encoding="utf-8")

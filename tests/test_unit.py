@@ -10,7 +10,7 @@ import time
 
 import pytest
 
-from tests.unit_file import UNIT, unit_file
+from tests.command import UNIT, unit_file
 
 CHECK, RUN, RUN_AT_ONCE = (
     "check configs/field.yaml --overlay /etc/grd/vehicle.yaml",

@@ -124,7 +124,7 @@ class Wiring:
         self.stages.append(StageRun(stage, inbox, counts, order, shared, lambda: self._switched_off(spec.name)))
 
     def _switched_off(self, stage: str) -> None:
-        """Tell the sinks that a stage feeds that it is switched off."""
+        """Notify the sinks that a stage feeds that it is switched off."""
         for edge in self.edges.values():
             if edge.count.edge.producer == stage:
                 for sink in self.sinks:

@@ -15,7 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from flow.link import LinkError
-from links.cli.console import EXIT_FAILED, err, out, progress_bar, report_errors, show_table, warn
+from links.cli.console import EXIT_FAILED, check_new, err, out, progress_bar, report_errors, show_table, warn
 from links.cli.files import read_rig
 
 if TYPE_CHECKING:  # scipy and numba are imported when the command runs
@@ -89,8 +89,7 @@ def calibrate_recording(
         raise LinkError(f"{target}: a rig file ends in .yaml")
     figures = target.with_suffix(".svg")
     for file in (target, figures):
-        if file.exists() and not overwrite:
-            raise LinkError(f"{file} is there already: name another with --out, or give --overwrite")
+        check_new(file, "--out", overwrite=overwrite)
     if to_s is not None and to_s <= from_s:
         raise LinkError(f"--to {to_s:g} is not after --from {from_s:g}")
     with progress_bar(f"read {recording.name}") as step:

@@ -24,13 +24,13 @@ from flow.link import Tap
 from flow.live.report import LinkState, LiveReport
 from flow.message import Message
 from links.cli.console import err, out
+from links.mavlink.frame_sender import POSE_REJECTED, SENT
 from links.runs.live_run import RunStatus
 from stages.messages import DroneFix, PositionEstimate, RelativePose, TrackState
 
 SCREEN_PERIOD_S, LINE_PERIOD_S = 0.25, 5.0
 RATE_S = 1.0  # rates are averages over this time at least
 MAX_EDGES, MAX_OTHERS, MAX_EVENTS = 3, 2, 3  # rows of the screen
-HELD_BACK, SENT = "pose rejected", "sent: "  # counters of the autopilot's link
 POSE_MESSAGES = ("ODOMETRY", "VISION_POSITION_ESTIMATE", "LANDING_TARGET")
 SHOWN = (RelativePose, DroneFix, TrackState)
 
@@ -201,8 +201,8 @@ def _edges(report: LiveReport) -> list[RenderableType]:
 def _to_autopilot(report: LiveReport) -> str:
     """How many poses were sent to the autopilot, and how many held back, by reason; empty without an autopilot."""
     for counts in report.counters.values():
-        sent = {kind: counts[SENT + kind] for kind in POSE_MESSAGES if SENT + kind in counts}
-        rejected = {name.partition(": ")[2] or name: n for name, n in counts.items() if name.startswith(HELD_BACK)}
+        sent = {kind: n for kind, n in counts.groups.get(SENT, {}).items() if kind in POSE_MESSAGES}
+        rejected = counts.groups.get(POSE_REJECTED, {})
         if sent or rejected:
             return f"to the autopilot: {_counts(sent) or 'nothing sent'}; held back: {_counts(rejected) or 'none'}"
     return ""

@@ -100,36 +100,9 @@ def run(
         return
     if against is not None:
         raise LinkError(f"--against is for a configuration that replays a recording, and {config} runs live")
-    err.print(f"loading {config}", markup=False)
     request = RunRequest(config, tuple(overlay or ()), tuple(sets or ()))
-    graph, folder = live_graph(request), _new_folder(out_dir, f"live-{config.stem}")
-    if parts := sorted(folder.glob("*.mcap")):
-        raise LinkError(
-            f"{folder} has the recording of an interrupted run already ({parts[0].name}): "
-            "name another --out, or move it"
-        )
-    if hosts is not None and host is not None:
-        graph = host_graph(graph, hosts, host, to_run=True)
-    for text in (*graph.left_out_texts(), *shipped_values(graph)):
-        warn(text)
-    if warm:
-        with progress_bar("loading compiled code (about two minutes when it must be compiled)", at_once=True) as step:
-            not_warm = warm_up(graph, step)
-        if not_warm:
-            warn(not_warm)
-    with LiveView() as view_of_run:
-        result = run_live(folder, request, graph, view_of_run.show, for_s, (view_of_run.latest,))
-    print_result(result)
-    if view:
-        _open_viewer(result.out_dir)
-    report = result.report
-    if isinstance(report, LiveReport) and report.switched_off:
-        err.print(f"'{report.switched_off[0]}' was switched off after repeated errors", markup=False, style="red")
-        raise typer.Exit(EXIT_FAILED)
-    if isinstance(report, LiveReport) and (texts := nothing_found(graph, result, report, config)):
-        for text in texts:
-            err.print(text, markup=False, style="red")
-        raise typer.Exit(EXIT_FAILED)
+    place = None if hosts is None or host is None else (hosts, host)
+    _run_live(request, _new_folder(out_dir, f"live-{config.stem}"), for_s, warm, place, view)
 
 
 @report_errors
@@ -201,6 +174,41 @@ def replay_recording(
         output_hash = result.output_hash
     if expect is not None and output_hash is not None and not hash_matches(expect, output_hash):
         err.print(f"the output hash is {output_hash}, expected {expect}", markup=False, style="red")
+        raise typer.Exit(EXIT_FAILED)
+
+
+def _run_live(
+    request: RunRequest, folder: Path, for_s: float | None, warm: bool, place: tuple[Path, str] | None, view: bool
+) -> None:
+    """Run live; `place`: the file of hosts and the name of this one."""
+    err.print(f"loading {request.config}", markup=False)
+    graph = live_graph(request)
+    if parts := sorted(folder.glob("*.mcap")):
+        raise LinkError(
+            f"{folder} has the recording of an interrupted run already ({parts[0].name}): "
+            "name another --out, or move it"
+        )
+    if place is not None:
+        graph = host_graph(graph, *place, to_run=True)
+    for text in (*graph.left_out_texts(), *shipped_values(graph)):
+        warn(text)
+    if warm:
+        with progress_bar("loading compiled code (about two minutes when it must be compiled)", at_once=True) as step:
+            not_warm = warm_up(graph, step)
+        if not_warm:
+            warn(not_warm)
+    with LiveView() as view_of_run:
+        result = run_live(folder, request, graph, view_of_run.show, for_s, (view_of_run.latest,))
+    print_result(result)
+    if view:
+        _open_viewer(result.out_dir)
+    report = result.report
+    if isinstance(report, LiveReport) and report.switched_off:
+        err.print(f"'{report.switched_off[0]}' was switched off after repeated errors", markup=False, style="red")
+        raise typer.Exit(EXIT_FAILED)
+    if isinstance(report, LiveReport) and (texts := nothing_found(graph, result, report, request.config)):
+        for text in texts:
+            err.print(text, markup=False, style="red")
         raise typer.Exit(EXIT_FAILED)
 
 

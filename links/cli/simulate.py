@@ -126,6 +126,13 @@ def simulate_matrix(
         bool,
         typer.Option("--varied-sky", help="Gliding, circling and hovering birds, flocks, insects, kites, bags."),
     ] = False,
+    clutter: Annotated[
+        bool,
+        typer.Option(
+            "--clutter",
+            help="Furniture, signs, boards, wires, people, reflections; cameras with rolling shutter, dirt and flare.",
+        ),
+    ] = False,
     lidar: Annotated[
         str, typer.Option("--lidar", metavar="MODEL", help="LiDAR of the rig, as `rig.lidar.model`: XT32, OS1-64, ...")
     ] = "VLP-16",
@@ -214,6 +221,7 @@ def simulate_matrix(
         perturbed,
         sparse,
         varied_sky,
+        clutter,
     )
     several = range(first_seed, first_seed + seeds)
     with progress_bar(f"{len(selected) * seeds} recordings") as step:

@@ -45,7 +45,7 @@ class Health(NamedTuple):
     goals_sent: int
     goals_expired: int  # not reached in time: the servo was stopped
     goals_lost: int  # arrived while no goal could be sent to the servo
-    parent_hangs: int  # stops in mid-travel because the parent sent no packet
+    parent_silent: int  # stops in mid-travel because the parent sent no packet
     no_reply: int
     damaged: int
     wrong: int  # late or foreign replies, discarded

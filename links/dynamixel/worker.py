@@ -125,7 +125,7 @@ class ServoWorker:
         if self._goal_ends_ns and measured.reply_ns > self._goal_ends_ns:
             self._abandon_goal(measured, "goals_expired")
         elif self._goal_ends_ns and now_ns > self._parent_ns + PARENT_TIMEOUT_NS:
-            self._abandon_goal(measured, "parent_hangs")
+            self._abandon_goal(measured, "parent_silent")
         if now_ns - self._supply_ns > SUPPLY_NS:
             self._supply_ns = now_ns
             self._supply = self._drive.supply()
@@ -258,7 +258,7 @@ class ServoWorker:
             goals_sent=counts["goals_sent"],
             goals_expired=counts["goals_expired"],
             goals_lost=counts["goals_lost"],
-            parent_hangs=counts["parent_hangs"],
+            parent_silent=counts["parent_silent"],
             no_reply=faults["no reply"],
             damaged=faults["damaged"],
             wrong=faults["late or foreign"],

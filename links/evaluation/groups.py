@@ -106,6 +106,7 @@ def quantile_95(ranks: pd.Series) -> float:
     return float(np.quantile(values, 0.95, method="inverted_cdf")) if len(values) else math.nan
 
 
+FIRST_ACCURATE = "first accurate\nmedian [s]", "first accurate\n95 % [s]"  # a failed run is longer than its duration
 COLUMNS: Columns = {
     "runs": (0, len),
     "track\naccuracy [%]": (1, _mean("track_accuracy")),
@@ -118,8 +119,8 @@ COLUMNS: Columns = {
     "observable\n[%]": (1, _percent("observable_share")),
     "detection\nrate [%]": (1, _percent("detection_rate")),
     "of observable\n[%]": (1, _percent("observable_detection_rate")),
-    "first accurate\nmedian [s]": (1, _median("first_accurate_s")),
-    "first accurate\n95 % [s]": (1, lambda runs: quantile_95(runs.first_accurate_s)),
+    FIRST_ACCURATE[0]: (1, _median("first_accurate_s")),
+    FIRST_ACCURATE[1]: (1, lambda runs: quantile_95(runs.first_accurate_s)),
     "return gap\nmedian [s]": (2, _median("longest_return_gap_s")),
     "return gap\nmax [s]": (2, _largest("longest_return_gap_s")),
     "reacquired": (0, _reacquisition(lambda times_s: np.isfinite(times_s).sum())),
@@ -258,7 +259,7 @@ def _table(title: str, groups: list[Group], key: Key, columns: Columns, note: st
     ]
     numbers = group_numbers(groups, columns)
     for head, (decimals, _) in columns.items():
-        never = failed_s if head.startswith("first accurate") else [None] * len(groups)
+        never = failed_s if head in FIRST_ACCURATE else [None] * len(groups)
         if np.isnan(numbers[head].to_numpy()).all():
             empty.append(head.replace("\n", " "))
         else:

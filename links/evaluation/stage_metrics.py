@@ -30,7 +30,7 @@ from links.evaluation.run_data import XYZ, RotationLog, Search
 from links.evaluation.text_files import Flags, Trajectory
 from stages.geometry.frames import Array64
 
-PROBABILITY_EDGES = (0.0, 0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 0.95, 1.0)  # the detector accepts from 0.95 on
+PROBABILITY_EDGES = (0.0, 0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 0.95, 1.0)  # bins of the reliability table
 SCORE_RANGES_M = (0.0, 15.0, 25.0, 35.0, 70.0)  # bands in which probabilities are scored
 FALSE_DETECTIONS = "false_detections_per_min"
 NO_SEARCH = "no complete search with a drone in reach"
@@ -130,7 +130,8 @@ def candidate_outcomes(e: Evaluation) -> pd.DataFrame:
         is_drone |= covered & (np.linalg.norm(rows[[*XYZ]] - xyz_m, axis=1) < e.limits.false_m)
     range_m = np.linalg.norm(rows[[*XYZ]], axis=1)
     columns = {"candidate": rows.candidate, "probability": rows.probability, "telemetry": rows.telemetry}
-    return pd.DataFrame(columns | {"range_m": range_m, "is_drone": is_drone})[known | is_drone]
+    counted = np.nonzero(known | is_drone)[0]
+    return pd.DataFrame(columns | {"range_m": range_m, "is_drone": is_drone}).take(counted)
 
 
 def probability_outcomes(e: Evaluation) -> pd.DataFrame:
@@ -141,7 +142,7 @@ def probability_outcomes(e: Evaluation) -> pd.DataFrame:
     rows = candidate_outcomes(e)
     bins = np.searchsorted(PROBABILITY_EDGES, rows.probability, side="right") - 1
     rows = rows.assign(bin=np.clip(bins, 0, len(PROBABILITY_EDGES) - 2))
-    return rows.drop_duplicates(["candidate", "bin"])[["candidate", "bin", "probability", "is_drone"]]
+    return rows.drop_duplicates(["candidate", "bin"]).drop(columns=["telemetry", "range_m"])
 
 
 def camera_rotation(e: Evaluation) -> Value | None:

@@ -13,7 +13,7 @@ import yaml
 
 from flow.config.yaml_text import YamlTextError, yaml_values
 from flow.link import LinkError
-from links.cli.console import out, report_errors
+from links.cli.console import check_new, out, report_errors
 from links.cli.files import Overwrite
 from stages.geometry.lens_files import CalibratedLens, LensFileError, lens_from_kalibr, lens_from_ocamcalib
 from stages.messages import CameraMount
@@ -50,8 +50,7 @@ def import_lens(
     target = out_file or file.with_suffix(f".{camera_mount.value}.rig.yaml")
     if target.suffix not in (".yaml", ".yml"):
         raise LinkError(f"{target}: a rig file ends in .yaml")
-    if target.exists() and (not overwrite or target.samefile(file)):
-        raise LinkError(f"{target} is there already: name another with --out, or give --overwrite")
+    check_new(target, "--out", overwrite=overwrite and target.resolve() != file.resolve())
     found = read_lens(file, camera, max_off_axis_deg)
     target.write_text(lens_text(found, camera_mount, file.name), encoding="utf-8")
     lens, size_px = found

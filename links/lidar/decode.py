@@ -19,7 +19,7 @@ import numpy as np
 from links.lidar.formats import AnyFormat, packet_format
 from links.lidar.packet_format import STRONGEST
 from links.lidar.velodyne import RETURN_MODE_AT
-from stages.kernels.lidar.packets import Rows, decode
+from stages.kernels.lidar.packets import Firings, decode
 from stages.messages import LidarFirings
 
 
@@ -35,7 +35,7 @@ class FiringRows:
         self._max_packets = max(1, round(self._slice_ns / packet_ns))
         size = self._max_packets * self._form.max_rows
         self._count = 0
-        self._rows = Rows(
+        self._rows = Firings(
             pulse_stamp_ns=np.empty(size, np.int64),
             laser=np.empty(size, np.uint8),
             azimuth_rad=np.empty(size, np.float32),

@@ -1,7 +1,7 @@
 """Packets of the Ouster OS0 and OS1: columns of 32 to 128 entries, little endian, legacy and the profiles after it.
 
 The frame is Ouster's lidar frame: x against the cable, where column 0 points. A column has its own time; all its lasers
-fire at once, from 16 or 28 mm beside the axis.
+fire at once, 16 or 28 mm from the axis.
 
 Source: Ouster firmware user manual, lidar data (https://ouster.com/sensor-docs/fw-user-manual/docs/sensor-data/lidar-data)
 and lidar data legacy; "Lidar Range to XYZ" for beams and origins.

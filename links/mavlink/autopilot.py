@@ -247,9 +247,9 @@ class Autopilot(Source[AutopilotSettings]):
             "timesync replies": decoder.clock.round_trips,
             **_clock_counters(decoder.clock),
         }
-        live = {} if self._session is None else self._session.counters
+        live = Counters() if self._session is None else self._session.counters
         not_connected = {"poses while not connected": self._not_connected} if self._not_connected else {}
-        return Counters(decoded | live | not_connected, decoder.rejected)
+        return Counters(decoded | live.totals | not_connected, decoder.rejected, live.groups)
 
 
 def _clock_counters(clock: DeviceClock) -> dict[str, int]:

@@ -27,8 +27,9 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import Any
 
+from flow.counters import Counters
 from flow.link import LinkError, Record
-from links.mavlink.frame_sender import FrameSender
+from links.mavlink.frame_sender import NOT_SENT, POSE_REJECTED, SENT, FrameSender
 from links.mavlink.origin import OriginSender
 from links.mavlink.poses.autopilot_estimate import EstimateEvent
 from links.mavlink.poses.gate import RejectReason
@@ -156,11 +157,15 @@ class AutopilotSession:
             return self._sender.records()
 
     @property
-    def counters(self) -> dict[str, int]:
-        """Totals since the start: received, sent, not sent, rejected poses by reason."""
+    def counters(self) -> Counters:
+        """Totals since the start; in groups what was sent and not sent by message, and rejected poses by reason."""
         with self._lock:
-            rejected = {f"pose rejected: {reason.value}": count for reason, count in self.poses.rejected.items()}
-            counts = self.counts | self._sender.counts
+            groups = {
+                SENT: dict(self._sender.sent),
+                NOT_SENT: dict(self._sender.not_sent),
+                POSE_REJECTED: {reason.value: count for reason, count in self.poses.rejected.items()},
+            }
+            counts = dict(self.counts)
             if self.poses.fusion.rejections:
                 counts["pose rejected by the autopilot"] = self.poses.fusion.rejections
             if self.origin.sent_times:
@@ -171,9 +176,8 @@ class AutopilotSession:
                 counts["pose and autopilot differ"] = self.switch.agreement.disagreements
             round_trip_ns = self._timesync.newest_ns
             intervals = self.intervals.counters
-        return {
+        totals = {
             **counts,
-            **rejected,
             **intervals,
             "stray bytes": self._splitter.stray_bytes,
             "from other senders": self.connection.foreign,
@@ -183,6 +187,7 @@ class AutopilotSession:
             **({"round trip [ms]": round_trip_ns // 1_000_000} if round_trip_ns is not None else {}),
             **({"signing time not written": self._signer.unwritten} if self._signer is not None else {}),
         }
+        return Counters(totals, groups=groups)
 
     @property
     def closed(self) -> bool:

@@ -17,6 +17,7 @@ from links.mavlink.transport.framing import dialect, packed
 from links.mavlink.transport.signing import Signer
 
 EARLIER_POSE = "ODOMETRY"  # of an earlier run
+SENT, NOT_SENT, POSE_REJECTED = "sent", "not sent", "pose rejected"  # groups of the link's counters
 SENT_RECORDS = 4096  # kept until `records` is called
 
 
@@ -33,7 +34,8 @@ class FrameSender:
         independence: Independence,
         sent_state: SentState,
     ) -> None:
-        self.counts: Counter[str] = Counter()
+        self.sent: Counter[str] = Counter()  # by message
+        self.not_sent: Counter[str] = Counter()  # the line was full or down
         self._connection, self._signer, self._now_ns, self._topic = connection, signer, now_ns, topic
         self._independence, self._sent_state = independence, sent_state
         self._mav = dialect().MAVLink(None, srcSystem=own[0], srcComponent=own[1])
@@ -57,9 +59,9 @@ class FrameSender:
         frame = packed(message, self._mav)
         kind = message.get_type()
         if not self._connection.send(frame):
-            self.counts[f"not sent: {kind}"] += 1
+            self.not_sent[kind] += 1
             return False
-        self.counts[f"sent: {kind}"] += 1
+        self.sent[kind] += 1
         self._independence.on_sent(kind, now_ns)
         if kind in POSES and odom is not None:
             self._sent_state.on_sent(frame, now_ns, odom)

@@ -58,9 +58,8 @@ def layout(
         return [(15, _curves(gate_limits, "/plots/gate/**"))] if gate else []
 
     def sigma() -> Rows:
-        return [
-            (16, _curves("Sigma of the position [m]: x red, y green, z blue, prediction orange", "/plots/sigma/**"))
-        ]
+        title = "Sigma of the position [m]: x red, y green, z blue, prediction orange"
+        return [(16, _curves(title, "/plots/sigma/**"))]
 
     images: Rows = [(32, rrb.Horizontal(*_image_views(vision)))] if vision.images else []
     overview = rrb.Horizontal(
@@ -84,13 +83,7 @@ def layout(
         ekf = _curves("The autopilot's EKF: test ratios, rejected above 1", "/plots/estimator/**", legend=True)
         left, right = _rows([*sent(), (24, ekf), *_states()]), rrb.Vertical(_log(), _status())
         tabs.append(rrb.Horizontal(left, right, name="Autopilot link"))
-    counts = _curves("Pulses and returns", "/plots/count/**", legend=True)
-    other = _curves("Lags of the edges, ages, speeds, counts", ["/plots/other/**", f"{EDGES}/**"], legend=True)
-    numbers = rrb.Vertical(counts, other, row_shares=[1, 3])
-    tabs.append(rrb.Horizontal(numbers, rrb.Vertical(_log(), _status()), column_shares=[2, 1], name="Timing"))
-    graph = rrb.TextDocumentView(name="Graph", origin="/about/graph")
-    settings = rrb.TextDocumentView(name="Settings", origin="/about/settings")
-    tabs.append(rrb.Horizontal(graph, settings, name="Configuration"))
+    tabs += [_timing(), _configuration()]
     return rrb.Blueprint(
         rrb.Tabs(*tabs),
         # Following: a live run advances, and a finished file opens at its end with complete curves.
@@ -99,6 +92,19 @@ def layout(
         rrb.SelectionPanel(state="collapsed"),
         auto_views=False,
     )
+
+
+def _timing() -> rrb.Container:
+    counts = _curves("Pulses and returns", "/plots/count/**", legend=True)
+    other = _curves("Lags of the edges, ages, speeds, counts", ["/plots/other/**", f"{EDGES}/**"], legend=True)
+    numbers = rrb.Vertical(counts, other, row_shares=[1, 3])
+    return rrb.Horizontal(numbers, rrb.Vertical(_log(), _status()), column_shares=[2, 1], name="Timing")
+
+
+def _configuration() -> rrb.Container:
+    graph = rrb.TextDocumentView(name="Graph", origin="/about/graph")
+    settings = rrb.TextDocumentView(name="Settings", origin="/about/settings")
+    return rrb.Horizontal(graph, settings, name="Configuration")
 
 
 def _states() -> Rows:

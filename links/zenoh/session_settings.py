@@ -12,7 +12,7 @@
 - Connect without timeout: otherwise a client with a broken connection stops reconnecting.
 
 Source: https://zenoh.io/docs/manual/access-control and /tls, Zenoh 1.10.2's defaults, and measurements
-(tests/benchmarks/bench_hosts.py, tests/links/zenoh).
+(tests/benchmarks/system/bench_hosts.py, tests/links/zenoh).
 """
 
 from __future__ import annotations

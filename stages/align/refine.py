@@ -172,38 +172,16 @@ def refine(
         _camera(drone, directions, yaw_rad, allowed),
     )
     a, yaw = directions.copy(), yaw_rad
-    squares = [
-        (i, j)
-        for i in range(K)
-        for j in range(i)
-        if abs(abs(half_turn_difference(a[i] - a[j])) - math.pi / 2) < SQUARE_RAD
-    ]
+    squares = _right_angles(directions)
     own_k = [set(camera.k.tolist()) for camera in cameras]
     shared = own_k[0] & own_k[1]
     if not shared and not any({i, j} & own_k[0] and {i, j} & own_k[1] for i, j in squares):
         return None
-    ties = np.zeros((2 * K + len(squares) + 4, unknowns))
-    seen = np.arange(K)
-    for c, camera in enumerate(cameras):
-        ties[c * K + seen, own[c] + seen] = 1 / allowed.direction_rad
-        ties[c * K + seen, street + seen] = -1 / allowed.direction_rad
-        for axis in range(2):
-            ties[2 * K + len(squares) + 2 * c + axis, 2 * c + axis] = 1 / camera.tilt_sigma_rad
-    ties[K + seen, 4] = 1 / allowed.direction_rad
-    for row, (i, j) in enumerate(squares, 2 * K):
-        ties[row, [street + i, street + j]] = 1 / allowed.square_rad, -1 / allowed.square_rad
+    ties = _ties(K, squares, cameras, allowed)
     information = np.eye(unknowns)
     weight = np.ones(len(ties))  # of the ties: reduced where the cameras disagree on a street
     for _ in range(ROUNDS):
-        off_square = [from_square(a[i] - a[j]) / allowed.square_rad for i, j in squares]
-        r_ties = np.concatenate(
-            [
-                (cameras[0].azimuth - a) / allowed.direction_rad,
-                (cameras[1].azimuth - a + yaw) / allowed.direction_rad,
-                off_square,
-                *(camera.tilt / camera.tilt_sigma_rad for camera in cameras),
-            ]
-        )
+        r_ties = _tie_residuals(a, yaw, squares, cameras, allowed)
         inflation = np.concatenate([camera.inflation for camera in cameras])
         weight[: 2 * K] = 1.0 / (inflation**2 + (r_ties[: 2 * K] / CAUCHY) ** 2)
         information[:] = (ties.T * weight) @ ties
@@ -230,6 +208,46 @@ def refine(
         directions=len(shared),
         vehicle_lines=round(cameras[0].effective_lines),
         drone_lines=round(cameras[1].effective_lines),
+    )
+
+
+def _right_angles(directions: Array64) -> list[tuple[int, int]]:
+    """Pairs of directions (K,) that are nearly at right angles."""
+    return [
+        (i, j)
+        for i in range(len(directions))
+        for j in range(i)
+        if abs(abs(half_turn_difference(directions[i] - directions[j])) - math.pi / 2) < SQUARE_RAD
+    ]
+
+
+def _ties(K: int, squares: list[tuple[int, int]], cameras: tuple[_Camera, _Camera], allowed: Tolerances) -> Array64:
+    """J (2 K + squares + 4, unknowns) of the constraints, in sigmas: directions of each camera, right angles, tilts."""
+    street, own = TILTS_AND_YAW, (TILTS_AND_YAW + K, TILTS_AND_YAW + 2 * K)
+    ties = np.zeros((2 * K + len(squares) + 4, TILTS_AND_YAW + 3 * K))
+    seen = np.arange(K)
+    for c, camera in enumerate(cameras):
+        ties[c * K + seen, own[c] + seen] = 1 / allowed.direction_rad
+        ties[c * K + seen, street + seen] = -1 / allowed.direction_rad
+        for axis in range(2):
+            ties[2 * K + len(squares) + 2 * c + axis, 2 * c + axis] = 1 / camera.tilt_sigma_rad
+    ties[K + seen, 4] = 1 / allowed.direction_rad
+    for row, (i, j) in enumerate(squares, 2 * K):
+        ties[row, [street + i, street + j]] = 1 / allowed.square_rad, -1 / allowed.square_rad
+    return ties
+
+
+def _tie_residuals(
+    a: Array64, yaw: float, squares: list[tuple[int, int]], cameras: tuple[_Camera, _Camera], allowed: Tolerances
+) -> Array64:
+    """r of the constraints, in sigmas, in the order of `_ties`."""
+    return np.concatenate(
+        [
+            (cameras[0].azimuth - a) / allowed.direction_rad,
+            (cameras[1].azimuth - a + yaw) / allowed.direction_rad,
+            [from_square(a[i] - a[j]) / allowed.square_rad for i, j in squares],
+            *(camera.tilt / camera.tilt_sigma_rad for camera in cameras),
+        ]
     )
 
 

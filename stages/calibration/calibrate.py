@@ -71,17 +71,7 @@ def calibrate(
 
     `parked`: the vehicle is known to have stood still. A servo that sweeps in both directions does not need it.
     """
-    if not rig.turns:
-        raise CannotCalibrate("the rig has a fixed LiDAR (turns: false): there is no servo mount")
-    if len(trace.stamp_ns) < 2:
-        raise CannotCalibrate(
-            "the recording contains no servo states: a LiDAR that does not turn observes no surface twice"
-        )
-    if len(returns.stamp_ns) < FEWEST_RETURNS:
-        raise CannotCalibrate(
-            f"the LiDAR returned {len(returns.stamp_ns)} pulses, at least {FEWEST_RETURNS} are needed: was it running?"
-        )
-    _check_travel(float(np.ptp(trace.position_rad)))  # first: the side of the play is not known for a servo at rest
+    _check_inputs(returns, trace, rig)
     numbers = servo_mount(rig)
     at = servo_at(trace, returns.stamp_ns, numbers, max_gap_s)
     if not np.isfinite(at.position_rad).any():
@@ -127,6 +117,21 @@ def calibrate(
         patches=patches,
         numbers=written,
     )
+
+
+def _check_inputs(returns: Returns, trace: ServoTrace, rig: LidarMount) -> None:
+    """Raise CannotCalibrate unless a turning LiDAR returned enough pulses."""
+    if not rig.turns:
+        raise CannotCalibrate("the rig has a fixed LiDAR (turns: false): there is no servo mount")
+    if len(trace.stamp_ns) < 2:
+        raise CannotCalibrate(
+            "the recording contains no servo states: a LiDAR that does not turn observes no surface twice"
+        )
+    if len(returns.stamp_ns) < FEWEST_RETURNS:
+        raise CannotCalibrate(
+            f"the LiDAR returned {len(returns.stamp_ns)} pulses, at least {FEWEST_RETURNS} are needed: was it running?"
+        )
+    _check_travel(float(np.ptp(trace.position_rad)))  # first: the side of the play is not known for a servo at rest
 
 
 def _check_travel(angle_rad: float) -> None:

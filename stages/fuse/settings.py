@@ -1,6 +1,6 @@
 """Assumed errors of the measurements, and limits of the states.
 
-Source: ours. Errors of fixes as in 30 simulated flights at 10 to 30 m (tests/benchmarks/bench_measured_errors.py):
+Source: ours. Errors of fixes as in 30 simulated flights at 10 to 30 m (bench_measured_errors.py):
 about their mean they have 0.70 of the reported variance and are correlated by 0.68, 0.59, 0.43, 0.26, 0.10 at 0.1,
 0.2, 0.3, 0.5, 1.0 s; their mean has 0.73 of the variance of the reported bias. The inflated white error that stands
 for them loses what differences of positions say, so its time constant is the one with which 95 % of the fused

@@ -1,6 +1,6 @@
 """The state of a drone that was lost, so that its heading is one hypothesis when a drone is found.
 
-At the propagated position it is the same drone, and its heading is decided again; elsewhere it may be another one, and
+At the propagated position it is the same drone, and its heading is decided again. Elsewhere it may be another one, and
 the remembered heading alone does not decide.
 
 Source: ours.

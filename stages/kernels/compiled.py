@@ -9,13 +9,15 @@ from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
 import numba
+from numba.core import config
 
-from flow.compile_cache import keep_compiled
+from flow.compile_cache import folder_of
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 COMPILED = ("stages/kernels", "links/simulated/kernels")  # folders with compiled functions
-CACHE_FOLDER = keep_compiled(COMPILED)
+CACHE_FOLDER = folder_of(COMPILED)
+config.CACHE_DIR = str(CACHE_FOLDER)  # pyright: ignore
 
 
 def compiled(function: F) -> F:

@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.geometry.frames import Array64, LidarMount
-from stages.kernels.sweep.turntable import Firings, Pulses, Returns, place_slice, turns_at
+from stages.kernels.lidar.packets import Firings
+from stages.kernels.sweep.turntable import Pulses, Returns, place_slice, turns_at
 from stages.messages import LidarFirings, ServoState, SweptPoints, SweptPulses
 
 STATES_KEPT = 512  # 5 s at 100 Hz: longer than any packet waits
@@ -108,30 +109,9 @@ class Turntable:
         A return without an angle is omitted and counted; pulses are empty unless the angle is known for all of them.
         """
         n = firings.pulse_stamp_ns.size
-        returns = Returns(
-            stamp_ns=np.empty(n, np.int64),
-            xyz_m=np.empty((n, 3), np.float32),
-            laser=np.empty(n, np.uint8),
-            reflectivity=np.empty(n, np.uint8),
-            turntable_rad=np.empty(n, np.float32),
-        )
-        pulses = Pulses(
-            stamp_ns=np.empty(n, np.int64),
-            direction=np.empty((n, 3), np.float32),
-            range_m=np.empty(n, np.float32),
-            laser=np.empty(n, np.uint8),
-            reflectivity=np.empty(n, np.uint8),
-        )
+        returns, pulses = _empty_returns(n), _empty_pulses(n)
         placed, unplaced, count, fired, origin = place_slice(
-            Firings(
-                firings.pulse_stamp_ns,
-                firings.laser,
-                firings.azimuth_rad,
-                firings.range_m,
-                firings.reflectivity,
-                firings.return_kind,
-                firings.xyz_lidar_m,
-            ),
+            _columns(firings),
             firings.laser_elevation_rad,
             turns,
             self._min_range_m,
@@ -178,3 +158,36 @@ class Turntable:
         after = int(np.searchsorted(state_ns, t_ns))
         gap_s = (state_ns[after] - state_ns[after - 1]) / 1e9
         return f"the servo was silent for {gap_s:.3f} s, allowed are {self._max_gap_ns / 1e9:.3f} s"
+
+
+def _columns(firings: LidarFirings) -> Firings:
+    """The arrays of a message as the kernel takes them."""
+    return Firings(
+        firings.pulse_stamp_ns,
+        firings.laser,
+        firings.azimuth_rad,
+        firings.range_m,
+        firings.reflectivity,
+        firings.return_kind,
+        firings.xyz_lidar_m,
+    )
+
+
+def _empty_returns(n: int) -> Returns:
+    return Returns(
+        stamp_ns=np.empty(n, np.int64),
+        xyz_m=np.empty((n, 3), np.float32),
+        laser=np.empty(n, np.uint8),
+        reflectivity=np.empty(n, np.uint8),
+        turntable_rad=np.empty(n, np.float32),
+    )
+
+
+def _empty_pulses(n: int) -> Pulses:
+    return Pulses(
+        stamp_ns=np.empty(n, np.int64),
+        direction=np.empty((n, 3), np.float32),
+        range_m=np.empty(n, np.float32),
+        laser=np.empty(n, np.uint8),
+        reflectivity=np.empty(n, np.uint8),
+    )

@@ -44,7 +44,7 @@ class Hypothesis:
     sample: OdometrySample | None = None  # odometry at stamp_ns when x was computed
     pass_sample: OdometrySample | None = None  # odometry at the start of the scan pass
     published_ns: int = 0
-    reason: str = ""
+    reason: str = "started at a candidate of the detector"
 
 
 class Hypotheses:

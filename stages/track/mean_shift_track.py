@@ -2,6 +2,9 @@
 
     F = {returns of this frame within r of t^0},  t^0 = the last frame's t,  then `stages/track/mean_shift.py`
 
+A detection is one pixel of the depth image. With `refine_detection` the track starts where the mean shift over the
+returns of that scan within r of it ends.
+
 The state is SEARCHING until a detection is accepted, then TRACKING. Frames without returns are normal, because the
 beams also point in other directions. After `lost_after_s` without returns the state is LOST for one frame, then
 SEARCHING. The frames' boundaries are a fixed time grid for the points' stamps, independent of the messages' boundaries.
@@ -13,12 +16,14 @@ While TRACKING, detections are not used, as in the paper, with one exception for
 is reset to a detection if `rival_sweeps` successive sweeps accept a drone farther than r from it and none within r, or
 one sweep does so in which the track had no return. `rival_sweeps: null` is the paper's method.
 
-Source: P III.C, Equation 6 (r = 1 m, n_max = 10, frames of 120 ms); states, covariance and rivals are ours.
+Source: P III.C, Equation 6 (r = 1 m, n_max = 10, first the initial scan, then frames of 120 ms); states, covariance and
+rivals are ours.
 """
 
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
@@ -31,6 +36,8 @@ from stages.geometry.frames import Array64
 from stages.kernels.track.mean_shift import mean_shift, within
 from stages.messages import Detections, DroneFix, MeanShiftResult, SweptPoints, TrackingState, TrackState
 from stages.track.mean_shift import crossings, fix_covariance_m2
+
+SCAN_NS = 5_300_000_000  # returns are kept for two sweeps of 180 deg at 11.4 rpm (P III.A)
 
 
 @dataclass(slots=True)
@@ -45,6 +52,7 @@ class _State:
     rivals: int = 0  # successive sweeps that accepted a drone at another position only
     event: str = "no drone detected yet"  # why the state is SEARCHING, or an event to report with the next state
     near: list[SweptPoints] = field(default_factory=lambda: list[SweptPoints]())  # F, slice by slice
+    scan: deque[SweptPoints] = field(default_factory=lambda: deque[SweptPoints]())  # since the last detections
 
 
 class MeanShiftTrackSettings(Settings):
@@ -52,6 +60,7 @@ class MeanShiftTrackSettings(Settings):
 
     radius_m: float = Field(1.0, gt=0, le=10)  # r, distance of the used returns from the last position
     acquire_radius_m: float = Field(3.0, gt=0, le=10)  # instead of r until the first returns; the paper's is r
+    refine_detection: bool = True  # mean shift over the scan that a detection is from, before the track starts
     max_iterations: int = Field(10, ge=1)  # n_max, per frame
     tolerance_m: float = Field(1e-4, ge=0)  # a shorter step ends the frame's iteration
     frame_s: float = Field(0.12, gt=0)  # duration of a frame
@@ -76,9 +85,10 @@ class MeanShiftTrack(Stage[MeanShiftTrackSettings]):
         settings = self.settings
         memory = self._state
         accepted = detections.xyz_vehicle_m[detections.accepted]
+        scan, memory.scan = memory.scan, deque()
         if memory.t_hat is None:
             if len(accepted):
-                self._start(detections.stamp_ns, accepted[0], "started at a detection")
+                self._start(detections.stamp_ns, accepted[0], scan, "started at a detection")
             return
         here = len(accepted) and (np.linalg.norm(accepted - memory.t_hat, axis=1) <= settings.radius_m).any()
         memory.rivals = 0 if here or not len(accepted) else memory.rivals + 1
@@ -91,12 +101,17 @@ class MeanShiftTrack(Stage[MeanShiftTrackSettings]):
         ):
             distance_m = float(np.linalg.norm(accepted[0] - memory.t_hat))
             why = "the last sweep had no return here" if unsupported else f"{memory.rivals} sweeps in a row agree"
-            self._start(detections.stamp_ns, accepted[0], f"moved {distance_m:.1f} m to a detection: {why}")
+            event = f"moved {distance_m:.1f} m to a detection: {why}"
+            self._start(detections.stamp_ns, accepted[0], scan, event)
 
     def on_points(self, points: SweptPoints) -> Iterator[DroneFix | TrackState]:
         """Collect the returns near t^0; evaluate completed frames."""
         memory = self._state
         stamps_ns = points.point_stamp_ns
+        if self.settings.refine_detection:
+            memory.scan.append(points)
+            while memory.scan[0].stamp_ns < points.stamp_ns - SCAN_NS:
+                memory.scan.popleft()
         if memory.frame_end_ns is None:
             memory.frame_end_ns = points.stamp_ns + self._frame_ns
         taken = 0
@@ -121,14 +136,24 @@ class MeanShiftTrack(Stage[MeanShiftTrackSettings]):
     def _frame_ns(self) -> int:
         return round(self.settings.frame_s * 1e9)
 
-    def _start(self, stamp_ns: int, xyz_vehicle_m: Array64, event: str) -> None:
+    def _start(self, stamp_ns: int, xyz_vehicle_m: Array64, scan: deque[SweptPoints], event: str) -> None:
         memory = self._state
-        memory.t_hat = xyz_vehicle_m.astype(np.float64)
+        memory.t_hat, refined = self._refined(xyz_vehicle_m.astype(np.float64), scan)
         memory.last_hit_ns = stamp_ns
         memory.acquired = memory.hit_since_sweep = False
         memory.rivals = 0
-        memory.event = event
+        memory.event = event + refined
         memory.near.clear()
+
+    def _refined(self, t_0: Array64, scan: deque[SweptPoints]) -> tuple[Array64, str]:
+        """Position (3,) after the mean shift over the returns of a scan within r of t_0, and a text about it."""
+        settings = self.settings
+        near = [s.xyz_vehicle_m[within(s.xyz_vehicle_m, t_0, settings.radius_m)] for s in scan]
+        hits = sum(len(points) for points in near)
+        if not hits:
+            return t_0, ""
+        t = mean_shift(np.concatenate(near).astype(np.float64), t_0, settings.max_iterations, settings.tolerance_m)[0]
+        return t, f", moved {float(np.linalg.norm(t - t_0)):.2f} m by {hits} returns of its scan"
 
     def _collect(self, points: SweptPoints, start: int, end: int) -> None:
         """Add returns start..end of a slice that lie within r of t^0 to the set F."""

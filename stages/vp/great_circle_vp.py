@@ -9,7 +9,7 @@ point is corrected to the exposure of the middle row with the angular rate of th
 `motion` on the vehicle. An image without enough straight lines gives no directions, and a reason.
 
 `min_direction_score`, `min_elsewhere_score` and `least_sigma_deg` were chosen on renders of three real panoramas; a
-fourth was kept back: tests/benchmarks/bench_vp_panoramas.py.
+fourth was kept back: tests/benchmarks/accuracy/bench_vp_panoramas.py.
 
 Source: ours, for P IV and V.C; DESIGN, The graph: vp.
 """

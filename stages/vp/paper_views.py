@@ -5,8 +5,8 @@ The optical axis of a view is `off_axis_deg` away from the optical axis of the l
 
     R_camera_view ((u - c) / f, (v - c) / f, 1),   c = (N - 1) / 2,   f = N / (2 tan(fov / 2))
 
-Source: P IV (three rectified views of 428 x 428 px, lines by LSD). The orientations of the three views are ours: the
-paper does not give them. LSD: Grompone von Gioi et al., PAMI 2010, as in OpenCV.
+Source: P IV (three rectified views of 428 x 428 px, lines by LSD). LSD: Grompone von Gioi et al., PAMI 2010, as in
+OpenCV.
 """
 
 from __future__ import annotations
@@ -92,9 +92,12 @@ class RectifiedView:
 
     def ends(self, segments: Array64) -> Array64:
         """Unit rays (n, 2, 3) of the ends of segments (n, 4), in the axes of the camera mount."""
-        rays = self._rays(segments.reshape(-1, 2)) @ self.R_mount_view.T
-        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        return rays.reshape(-1, 2, 3)
+        return self.directions(segments.reshape(-1, 2)).reshape(-1, 2, 3)
+
+    def directions(self, pixels: Array64) -> Array64:
+        """Unit rays (n, 3) of pixels (n, 2) u, v, in the axes of the camera mount."""
+        rays = self._rays(pixels) @ self.R_mount_view.T
+        return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
     def _rays(self, pixels: Array64) -> Array64:
         return np.column_stack([(pixels - self._centre_px) / self._focal_px, np.ones(len(pixels))])

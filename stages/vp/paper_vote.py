@@ -1,15 +1,18 @@
-"""Grid vote on the sphere for the intersections of pairs of lines, and completion of two directions to three.
+"""Grid votes for the intersections of pairs of lines, in the image or on the sphere; completion of two directions.
 
-Every pair of lines intersects in one direction v = n_i x n_j (n: normal of a great circle), with v and -v equivalent.
-It adds
+Every pair of lines adds
 
     w = l_i l_j |sin 2 theta|       l: lengths, theta: angle between the lines in the view
 
-to its cell. The grid is that of a cube: a cell is about 1 deg wide everywhere, and opposite sides of the sphere share
-cells. The vanishing point is the mean of the votes in the fullest cell and its eight neighbours.
+to the cell of its intersection. The vanishing point is the mean of the votes in the fullest cell and its eight
+neighbours.
 
-Source: P IV (grid vote, two directions and their cross product). The weight is that of Lu et al., WACV 2017, whose
-grid has poles; the cube grid has none. The mean in the cell is ours.
+image     the pixels of a view, divided into square cells; intersections outside the view do not vote
+sphere    directions v = n_i x n_j (n: normal of a great circle), with v and -v equivalent, on the faces of a cube: a
+          cell is about 1 deg wide everywhere, and opposite sides of the sphere share cells
+
+Source: P IV (grid vote in the image, two directions and their cross product). The weight is that of Lu et al., WACV
+2017, whose grid on the sphere has poles; the cube has none. The sphere and the mean in the cell are ours.
 """
 
 from __future__ import annotations

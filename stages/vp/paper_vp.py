@@ -7,20 +7,22 @@ The two directions are not made orthogonal: the alignment does that. Two at less
 There is one Manhattan frame, as in the paper. In a town with streets at other angles it may follow any of them, or mix
 two.
 
-Each view takes a vanishing point at least `apart_deg` from those of the previous views, because independent views
-often all choose the vertical.
+`vote: image` counts intersections inside a view, so each view has to contain a vanishing point: one view on the axis of
+the lens contains the vertical, two at its side, 90 deg apart, a horizontal direction each (`configs/paper.yaml`). With
+`vote: sphere` each view takes a vanishing point at least `apart_deg` from those of the previous views, because
+independent views often all choose the vertical.
 
 `is_vertical` marks the direction within `vertical_deg` of the up axis of the camera mount; the paper does not need
 it. The paper gives no sigma either, so `sigma_deg` is a setting.
 
-Source: P IV, V.C. The directions and the field of view of the views are ours: the paper does not give them.
+Source: P IV, V.C. `docs/explanation/paper.md` lists what differs from the paper, and what it does not give.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -28,7 +30,7 @@ from pydantic import Field, model_validator
 from flow.stage import Settings, Stage
 from stages.geometry.frames import Array64, Pose
 from stages.geometry.lens import Lens
-from stages.kernels.vp.paper_vote import fullest, vote
+from stages.kernels.vp.paper_vote import fullest, fullest_in_image, vote, vote_in_image
 from stages.messages import CameraMount, Image, VanishingDirections
 from stages.vp.paper_views import RectifiedView, ViewDirection, great_circles, segment_length_px
 from stages.vp.paper_vote import complete, most_orthogonal
@@ -67,9 +69,10 @@ class PaperVpSettings(Settings):
     fov_deg: float = Field(90.0, gt=20, le=120)
     min_length_px: float = Field(20.0, ge=5)
     max_lines: int = Field(200, ge=2, le=1000)  # the longest of each view
-    cells: int = Field(90, ge=10, le=360)  # of the grid, per 90 deg
+    vote: Literal["sphere", "image"] = "sphere"
+    cells: int = Field(90, ge=10, le=360)  # of the grid, per 90 deg of the sphere or side of a view
     min_lines: int = Field(10, ge=2)  # within 2 deg of a view's vanishing point; with fewer the view has none
-    apart_deg: float = Field(20.0, ge=0, lt=45)  # between the vanishing points of the views; 0: independent views
+    apart_deg: float = Field(20.0, ge=0, lt=45)  # between the points of the views by `sphere`; 0: independent views
     min_angle_deg: float = Field(80.0, gt=5, lt=90)  # between the two selected vanishing points
     vertical_deg: float = Field(30.0, gt=0, le=45)
     sigma_deg: float = Field(1.0, gt=0)
@@ -128,13 +131,22 @@ class PaperVp(Stage[PaperVpSettings]):
         normal = great_circles(ends)
         point = None
         if len(segments) >= settings.min_lines:
-            angles = np.arctan2(segments[:, 3] - segments[:, 1], segments[:, 2] - segments[:, 0])
-            lengths, others = segment_length_px(segments), np.array(taken).reshape(-1, 3)
-            votes = vote(normal, lengths, angles, settings.cells, others, math.radians(settings.apart_deg))
-            found, share = fullest(*votes)
+            found, share = self._fullest(view, segments, normal, taken)
             through = np.count_nonzero(np.abs(normal @ found) <= math.sin(math.radians(ON_DIRECTION_DEG)))
             point = found if share > 0 and through >= settings.min_lines else None
         return _Lines(ends, normal, view.normal_sigma_rad(segments), point)
+
+    def _fullest(
+        self, view: RectifiedView, segments: Array64, normal: Array64, taken: list[Array64]
+    ) -> tuple[Array64, float]:
+        """Direction (3,) with the most votes of a view's lines, and its share of all votes; share 0: none."""
+        settings = self.settings
+        if settings.vote == "image":
+            u, v, share = fullest_in_image(*vote_in_image(segments, settings.view_px, settings.cells))
+            return view.directions(np.array([[u, v]]))[0], share
+        angles = np.arctan2(segments[:, 3] - segments[:, 1], segments[:, 2] - segments[:, 0])
+        lengths, others = segment_length_px(segments), np.array(taken).reshape(-1, 3)
+        return fullest(*vote(normal, lengths, angles, settings.cells, others, math.radians(settings.apart_deg)))
 
     def _message(
         self, stamp_ns: int, lines: list[_Lines], directions: Array64 | None, reason: str

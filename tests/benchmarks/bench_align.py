@@ -1,4 +1,4 @@
-"""Time per pair of pictures: `python -m pytest tests/benchmarks/bench_align.py`. Goal: 3 ms a pair, one core.
+"""Time per pair of images: `python -m pytest tests/benchmarks/bench_align.py`. Goal: 3 ms a pair, one core.
 
 Side by side: our joint alignment and the paper's smallest-angle matching on the same messages, and the parts of ours.
 """

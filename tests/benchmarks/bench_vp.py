@@ -155,7 +155,7 @@ def line_of(name, errors, seconds):
     )
 
 
-def test_ours_beside_lu_vp_detect_on_york_urban():
+def test_grd_and_lu_vp_detect_on_york_urban():
     if not YORK.exists():
         pytest.skip("York Urban is not here (../shared/data/vp_york_urban)")
     folders = sorted(YORK.glob("P*"))

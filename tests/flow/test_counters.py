@@ -15,6 +15,15 @@ def test_rejected_inputs_are_kept_next_to_totals():
     assert not Counters()
 
 
+def test_counts_of_a_group_are_kept_by_their_names():
+    counters = Counters({"lost": 7}, {"damaged": 2}, {"sent": {"ODOMETRY": 5}})
+    assert counters.groups == {"sent": {"ODOMETRY": 5}, "rejected": {"damaged": 2}}
+    assert counters == {"lost": 7, "sent: ODOMETRY": 5, "rejected: damaged": 2}
+    total = counters + Counters(groups={"sent": {"ODOMETRY": 1, "HEARTBEAT": 2}})
+    assert total.groups == {"sent": {"ODOMETRY": 6, "HEARTBEAT": 2}, "rejected": {"damaged": 2}}
+    assert Counters.of_json(json.loads(json.dumps(counters.to_json()))).groups == counters.groups
+
+
 def test_a_plain_mapping_has_totals_only():
     counts = Counters({"lost": 7}, {"damaged": 2})
     assert Counters.of(counts) is counts

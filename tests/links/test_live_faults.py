@@ -30,9 +30,9 @@ from pymavlink.dialects.v20 import ardupilotmega
 from links.recording import RecordingReader
 from links.runs.truth import TruthLog
 from links.simulated.rig.live_images import MjpegServer
+from tests.command import unit_file
 from tests.links.fault_bounds import BOUNDS, FIRST_POSE_S, FIRST_POSITION_S, KILLED, MAX_RECORDING_LOSS_S, REST_S
 from tests.links.ports import free_ports
-from tests.unit_file import unit_file
 
 pytestmark = pytest.mark.slow
 pytest.importorskip("embreex", reason="simulating needs embreex: pip install -e '.[simulate]'")

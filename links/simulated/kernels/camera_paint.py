@@ -14,7 +14,7 @@ import numpy as np
 
 from stages.kernels.compiled import compiled
 
-PLAIN, BRICK, RENDERED, GLASS, ROAD, SLABS, LEAF, PAINT, GRASS = range(9)  # textures
+PLAIN, BRICK, RENDERED, GLASS, ROAD, SLABS, LEAF, PAINT, GRASS, PRINT = range(10)  # textures
 FRAME_M = 0.07  # width of a window frame
 SKY_PX = 768  # side of the sky map: the zenith is its centre, the inscribed circle is LOWEST_SKY_DEG below the horizon
 LOWEST_SKY_DEG = 6.0
@@ -23,7 +23,7 @@ LOWEST_SKY_DEG = 6.0
 @compiled
 def shade(
     directions, points, normals, ranges, surface, tint, window, lit, pixel_rad, street,
-    kinds, colours, others, noise, sun, sun_rgb, above, below, haze, extinction, sky,
+    kinds, colours, others, noise, sun, sun_rgb, above, below, haze, extinction, sky, mirrored,
 ):  # fmt: skip
     """Linear RGB (n, 3) of samples; see `links.simulated.sensors.camera_paint.radiance`."""
     out = np.empty((len(surface), 3), dtype=np.float32)
@@ -43,7 +43,7 @@ def shade(
         kind = kinds[s]
         for j in range(3):
             colour[j] = colours[s, j] + tint[i] * (others[s, j] - colours[s, j])
-        gloss = _texture(kind, colour, points[i], n0, n1, n2, width, window[i], street, noise)
+        gloss = _texture(kind, colour, points[i], n0, n1, n2, width, window[i], street, noise, tint[i])
 
         towards = n0 * sun[0] + n1 * sun[1] + n2 * sun[2]
         direct = max(towards, 0.0) if lit[i] else 0.0
@@ -56,6 +56,9 @@ def shade(
             mirror = gloss * (0.08 + 0.92 * (1.0 - facing) ** 5)  # Schlick, both faces of a pane
             r0, r1, r2 = d[0] + 2 * facing * n0, d[1] + 2 * facing * n1, d[2] + 2 * facing * n2
             _sky(r0, r1, r2, sky, haze, colour)
+            if len(mirrored) > 0 and mirrored[i, 0] >= 0.0:
+                for j in range(3):
+                    colour[j] = mirrored[i, j]
             for j in range(3):
                 emitted[j] = (1.0 - mirror) * emitted[j] + mirror * min(colour[j], 4.0)
         clear = math.exp(-extinction * ranges[i])
@@ -65,7 +68,7 @@ def shade(
 
 
 @compiled
-def _texture(kind, colour, p, n0, n1, n2, width, window, street, noise):
+def _texture(kind, colour, p, n0, n1, n2, width, window, street, noise, tint):
     """Modulates `colour` in place; returns the gloss of the surface (1: window glass)."""
     x = street[0] * p[0] - street[1] * p[1]
     y = street[1] * p[0] + street[0] * p[1] + street[2]
@@ -106,9 +109,26 @@ def _texture(kind, colour, p, n0, n1, n2, width, window, street, noise):
         grain = 1.0 + 0.8 * (_noise(x / 1.2, y / 1.2, width / 1.2, noise) - 0.5)
         for j in range(3):
             colour[j] *= grain
+    elif kind == PRINT:
+        _print(colour, window, width, noise, tint)
     elif kind == PAINT:
         return 0.3
     return 0.0
+
+
+@compiled
+def _print(colour, window, width, noise, tint):
+    """Bars at an angle of the object's own, and rows of blotches that resemble text, on its face."""
+    turn = 40.0 * tint
+    c, s = math.cos(turn), math.sin(turn)
+    a, b = c * window[0] + s * window[1], c * window[1] - s * window[0]
+    period = 0.12 + 0.5 * (17.0 * tint - math.floor(17.0 * tint))
+    bar = 0.8 * _stripes(a, 4.0 * period, period, width)
+    row = _stripes(b, 0.16, 0.07, width)
+    text = 0.9 * row * (1.0 if _noise(a / 3.0, math.floor(b / 0.16) / 5.0 + tint, width / 3.0, noise) > 0.5 else 0.0)
+    ink = max(bar, text) if tint > 0.3 else bar
+    for j in range(3):
+        colour[j] *= 1.0 - ink * (0.85 - 0.25 * j * tint)
 
 
 @compiled

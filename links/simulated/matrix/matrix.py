@@ -55,6 +55,8 @@ SERVO = ServoSettings(command_latency_s=0.002, command_jitter_s=5e-4, encoder_er
 SWEEPS = (SweepSegment(times=100),)
 SWEEP_THEN_FOLLOW = (SweepSegment(), VibrateSegment(duration_s=60.0, follow_drone=True))
 RAIN = Weather(rain_mmph=5.0)
+READOUT_MS = 20.0  # of a common rolling shutter, first to last row
+CLUTTERED_LENS = {"dirt_spots": 12, "flare": 1.0}
 
 
 @dataclass(frozen=True)
@@ -72,6 +74,7 @@ class Conditions:
     perturbed: bool = False  # the rig differs from its file, and the kind of drone varies between flights
     sparse: bool = False  # fewer rays per pulse: half the time
     varied_sky: bool = False  # movers of `links/simulated/world/sky_movers.py`
+    clutter: bool = False  # of the scene; with it rolling shutter, dirt and flare, and a sun of the seed's own
 
 
 def cells(only: Sequence[str] = ("*",), pairs: bool = False) -> list[Cell]:
@@ -138,7 +141,9 @@ def scenario_of(cell: Cell, seed: int, conditions: Conditions | None = None) -> 
         seed=seed,
         start_utc=datetime.datetime(2025, 6, 1, 10, 20, 30, tzinfo=datetime.UTC),
         duration_s=cell.duration_s,
-        scene=SceneSettings(kind=cell.scene, sky="varied" if conditions.varied_sky else "usual"),
+        scene=SceneSettings(
+            kind=cell.scene, sky="varied" if conditions.varied_sky else "usual", clutter=conditions.clutter
+        ),
         vehicle={"camera_height_m": CAMERA_HEIGHT_M, "path": vehicle},  # pyright: ignore[reportArgumentType]
         drone=drones[0] if drones else None,
         other_drones=drones[1:],
@@ -151,11 +156,21 @@ def scenario_of(cell: Cell, seed: int, conditions: Conditions | None = None) -> 
             range_offset_m=0.0 if perturbed is None else perturbed.range_offset_m,
         ),
         cameras=_cameras(conditions, bool(drones), perturbed),
-        weather=RAIN if conditions.rain else Weather(),
+        weather=_weather(conditions, seed),
         vehicle_odometry=VehicleOdometrySettings() if conditions.odometry else None,
         rig=nominal.model_copy(update={"mount": calibrated}) if conditions.calibrated else nominal,
         true_mount=true_mount,
     )
+
+
+def _weather(conditions: Conditions, seed: int) -> Weather:
+    """The weather of a flight; with clutter each seed has its own sun."""
+    weather = RAIN if conditions.rain else Weather()
+    if not conditions.clutter:
+        return weather
+    rng = np.random.default_rng([seed, 32])
+    sun = {"sun_elevation_deg": rng.uniform(15.0, 60.0), "sun_azimuth_deg": rng.uniform(0.0, 360.0)}
+    return weather.model_copy(update=sun)
 
 
 def _cameras(conditions: Conditions, drone: bool, perturbed: PerturbedRig | None) -> CamerasSettings:
@@ -163,6 +178,8 @@ def _cameras(conditions: Conditions, drone: bool, perturbed: PerturbedRig | None
     if conditions.cameras_hz is None:
         return CamerasSettings()
     one = CameraSettings(rate_hz=conditions.cameras_hz, size_px=conditions.cameras_px, readout_ms=conditions.readout_ms)
+    if conditions.clutter:
+        one = one.model_copy(update=CLUTTERED_LENS | ({} if conditions.readout_ms else {"readout_ms": READOUT_MS}))
     vehicle = drones = one
     if perturbed is not None:
         vehicle = one.model_copy(update={"miscalibration": perturbed.camera_vehicle})

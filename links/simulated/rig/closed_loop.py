@@ -145,7 +145,7 @@ class ClosedLoop:
         if self._servo is not None:  # these commands went to the simulated servo
             counters = report.counters[self._servo_name]
             totals = {name: count for name, count in counters.totals.items() if name != NOT_LIVE}
-            report.counters[self._servo_name] = Counters(totals, counters.rejected)
+            report.counters[self._servo_name] = Counters(totals, groups=counters.groups)
         return report
 
     @property

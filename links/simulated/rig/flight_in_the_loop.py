@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from flow.link import TRUTH_TOPICS, LinkError, Record
-from links.simulated.autopilot.flight_stack.outcome import FlightOutcome, Outcome
+from links.simulated.autopilot.flight_stack.outcomes.outcome import FlightOutcome, Outcome
 from links.simulated.autopilot.flight_stack.stack import FlightStack
 from links.simulated.rig.closed_loop import ClosedLoop
 from links.simulated.rig.scenario import Scenario

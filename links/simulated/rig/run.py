@@ -19,7 +19,7 @@ from flow.link import TRUTH_TOPICS, LinkError, Record
 from links.lidar import packet_format
 from links.recording import RecordingWriter
 from links.simulated.autopilot.autopilot import Autopilot
-from links.simulated.autopilot.flight_stack.outcome import Outcome
+from links.simulated.autopilot.flight_stack.outcomes.outcome import Outcome
 from links.simulated.autopilot.flight_stack.stack import FlightStack
 from links.simulated.kernels.lidar import lidar_poses
 from links.simulated.pose_sensors.fix_sensor import FixSensor
@@ -93,38 +93,18 @@ class Simulation:
         self.seed = self.scenario.seed
         drone = scenario.drone
         start_ns, duration_s = scenario.start_ns, scenario.duration_s
-        drone_motion: Path | Flight | FlownMotion | None = drone.path if drone else None
         self.telemetry_sources: list[Autopilot | FlightStack | VehicleOdometry | RotationSensor] = []
         self.flight: FlightInTheLoop | None = None
-        vehicle = scenario.vehicle
-        vehicle_motion: Path | SuspendedPath = vehicle.path
-        if vehicle.suspension is not None:
-            vehicle_motion = SuspendedPath(vehicle.path, vehicle.suspension, duration_s, self.seed)
+        vehicle_motion = _vehicle_motion(self.scenario)
         odometry: VehicleOdometry | None = None
         if scenario.vehicle_odometry is not None:
             odometry = VehicleOdometry(scenario.vehicle_odometry, vehicle_motion, start_ns, duration_s, self.seed)
-        if drone is not None and scenario.autopilot is not None and scenario.autopilot.flight_stack is not None:
-            self.flight = FlightInTheLoop(self.scenario, loop, odometry)
-            drone_motion = self.flight.stack.motion
-            self.telemetry_sources.append(self.flight.stack)
-        elif drone is not None and scenario.autopilot is not None:
-            drone_motion = Flight(drone.path, scenario.autopilot.flight, duration_s, self.seed)
-            self.telemetry_sources.append(Autopilot(scenario.autopilot, drone_motion, start_ns, duration_s, self.seed))
+        drone_motion = self._drone_motion(odometry)
         if odometry is not None:
             self.telemetry_sources.append(odometry)
         others = scenario.other_drones
         self.truth = Truth(start_ns, vehicle_motion, drone_motion, tuple(other.path for other in others))
-        height = scenario.vehicle.camera_height_m
-        world = scenario_world(self.scenario)
-        self._scene = Scene(
-            world.mesh,
-            vehicle_mesh(height),
-            drone_shapes(drone.span_m, drone.model) if drone else (),
-            self.truth,
-            world.movers,
-            scenario.weather.wetness,
-            [drone_shapes(other.span_m, other.model) for other in others],
-        )
+        self._scene = _scene(self.scenario, self.truth)
         spans_m = [flying.span_m for flying in (drone, *others) if flying is not None]
         planned = self.truth if self.flight is None else dataclasses.replace(self.truth, drone=drone and drone.path)
         check_paths(self._scene.world, planned, scenario.duration_s, spans_m)
@@ -155,6 +135,20 @@ class Simulation:
         self.returns = 0
         self.drone_return_ns: list[int] = []  # truth, for statistics: times of returns from drones
 
+    def _drone_motion(self, odometry: VehicleOdometry | None) -> Path | Flight | FlownMotion | None:
+        """The drone's motion: its path, a flight along it, or that of an autopilot in the loop. Adds the autopilot."""
+        scenario, drone, autopilot = self.scenario, self.scenario.drone, self.scenario.autopilot
+        if drone is None or autopilot is None:
+            return drone.path if drone else None
+        if autopilot.flight_stack is not None:
+            self.flight = FlightInTheLoop(scenario, self._loop, odometry)
+            self.telemetry_sources.append(self.flight.stack)
+            return self.flight.stack.motion
+        start_ns, duration_s = scenario.start_ns, scenario.duration_s
+        motion = Flight(drone.path, autopilot.flight, duration_s, self.seed)
+        self.telemetry_sources.append(Autopilot(autopilot, motion, start_ns, duration_s, self.seed))
+        return motion
+
     def _rendered_cameras(self) -> list[Camera]:
         scenario, height = self.scenario, self.scenario.vehicle.camera_height_m
         return build_cameras(
@@ -165,6 +159,7 @@ class Simulation:
             vehicle_mesh_from_camera(height, scenario.mount),
             scenario.start_ns,
             self.seed,
+            reflections=scenario.scene.clutter,
         )
 
     def records(self) -> Iterator[Record]:
@@ -279,6 +274,26 @@ class Simulation:
             arrival_ns = int(last_pulse_ns[i] + jitter_ns[i])
             records.append(Record("/lidar/packets", arrival_ns=arrival_ns, stamp_ns=at // 1000 * 1000, data=data))
         return records + self._truth_records.hits(pulse_ns.reshape(packets, -1), pulses)
+
+
+def _vehicle_motion(scenario: Scenario) -> Path | SuspendedPath:
+    vehicle = scenario.vehicle
+    if vehicle.suspension is None:
+        return vehicle.path
+    return SuspendedPath(vehicle.path, vehicle.suspension, scenario.duration_s, scenario.seed)
+
+
+def _scene(scenario: Scenario, truth: Truth) -> Scene:
+    world, drone = scenario_world(scenario), scenario.drone
+    return Scene(
+        world.mesh,
+        vehicle_mesh(scenario.vehicle.camera_height_m),
+        drone_shapes(drone.span_m, drone.model) if drone else (),
+        truth,
+        world.movers,
+        scenario.weather.wetness,
+        [drone_shapes(other.span_m, other.model) for other in scenario.other_drones],
+    )
 
 
 def simulate_records(scenario: Scenario, seed: int | None = None) -> Iterator[Record]:

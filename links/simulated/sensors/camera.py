@@ -16,10 +16,19 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from flow.link import Record
 from links.recording import CompressedImage, encode_compressed_image
+from links.simulated.kernels.ray_casting import Array32
 from links.simulated.sensors.camera_mask import own_body
 from links.simulated.sensors.camera_paint import Street
 from links.simulated.sensors.camera_rays import CameraScene
-from links.simulated.sensors.camera_sensor import SensorSettings, auto_exposure, develop, encode_jpeg, transmission
+from links.simulated.sensors.camera_sensor import (
+    SensorSettings,
+    auto_exposure,
+    develop,
+    dirt,
+    encode_jpeg,
+    flare,
+    transmission,
+)
 from links.simulated.sensors.camera_view import RenderRays, Shutter, View, mean_radiance, render
 from links.simulated.world.mesh import Mesh, RayScene
 from links.simulated.world.scene import Scene
@@ -33,6 +42,10 @@ DOWNWARD_RPY_DEG = (180.0, 0.0, -90.0)  # the top of the image is forward, its r
 BELOW_BODY_M = 0.02
 CameraMount = Literal["vehicle", "drone"]
 AnyLens = Equidistant | KannalaBrandt | OCam
+
+
+def _is_zero(value: object) -> bool:
+    return value == 0
 
 
 def _is_none(value: object) -> bool:
@@ -77,6 +90,8 @@ class CameraSettings(_Settings):
     mount: Pose | None = None  # T_vehicle_camera or T_drone_camera; null: at the vehicle origin, under the drone
     rate_hz: float = Field(default=10.0, ge=1, le=15)
     readout_ms: float = Field(default=0.0, ge=0, le=60)  # first to last row; 0: a global shutter
+    dirt_spots: Annotated[int, Field(exclude_if=_is_zero, ge=0, le=100)] = 0  # on the lens
+    flare: Annotated[float, Field(exclude_if=_is_zero, ge=0, le=2)] = 0.0  # strength of glare, streaks, ghosts; 0: none
     latency_ms: tuple[float, float] = (30.0, 80.0)  # shortest and longest, from the end of the readout to arrival
     sensor: SensorSettings = SensorSettings()
     miscalibration: Annotated[CameraMiscalibration | None, Field(exclude_if=_is_none)] = (
@@ -156,6 +171,11 @@ class Camera:
         self._view = View(scene, self._pixels, self.T_world_camera, own, covered)
         limit_rad = math.radians(settings.true_lens.max_off_axis_deg)
         self._transmission = transmission(self._pixels.off_axis_rad, limit_rad, settings.sensor.vignetting)
+        if settings.dirt_spots:
+            rng = np.random.default_rng([seed, 23, own])
+            self._transmission *= dirt(
+                self._pixels.rows, self._pixels.columns, settings.size_px, settings.dirt_spots, rng
+            )
         self._times = FrameTimes(platform, settings, start_ns, seed)
         self._frame = 0
 
@@ -180,8 +200,22 @@ class Camera:
         row_s = 1e-3 * self.settings.readout_ms / self.settings.size_px
         shutter = Shutter(stamp_ns, exposure_s, row_s)
         radiance = render(self._view, shutter, rng)
+        if self.settings.flare:
+            self._add_flare(radiance, stamp_ns)
         radiance[self._pixels.rows, self._pixels.columns] *= self._transmission[:, None]
         return develop(radiance, self.settings.sensor, exposure_s, gain, rng)
+
+    def _add_flare(self, radiance: Array32, stamp_ns: int) -> None:
+        """Add the lens flare, if the sun is in the field of view and nothing hides it."""
+        scene, at = self._view.scene, np.array([stamp_ns])
+        R, t = self.T_world_camera(at)
+        sun_px = self.settings.true_lens.project((scene.light.sun_direction @ R[0])[None])[0]
+        if np.isfinite(sun_px).all() and scene.light.sun_rgb.any() and scene.sees_sun(t[0], at):
+            centre_px = np.array(self.settings.true_lens.centre_px)
+            added = np.zeros_like(radiance)
+            flare(added, sun_px, centre_px, self.settings.flare, scene.light.sun_rgb)
+            inside = self._pixels.rows, self._pixels.columns
+            radiance[inside] += added[inside]
 
     def _record(self, frame: int) -> Record:
         stamp_ns = self._times.stamp_ns(frame)
@@ -198,6 +232,8 @@ def build_cameras(
     vehicle_from_camera: Mesh,
     start_ns: int,
     seed: int,
+    *,
+    reflections: bool = False,
 ) -> list[Camera]:
     """The cameras of the scenario. The vehicle's camera is inside the vehicle mesh, so it gets another mesh."""
     cameras: list[Camera] = []
@@ -206,7 +242,9 @@ def build_cameras(
         if platform == "vehicle":
             own = next(i for i, body in enumerate(bodies) if body.name == platform)
             bodies[own] = dataclasses.replace(bodies[own], meshes=(vehicle_from_camera,))
-        around = CameraScene(scene.world, scene.world_mesh, bodies, street, light(weather, seed))
+        around = CameraScene(
+            scene.world, scene.world_mesh, bodies, street, light(weather, seed), reflections=reflections
+        )
         drone = next((body.meshes[0] for body in bodies if body.name == "drone"), None)
         cameras.append(Camera(platform, one, camera_mount(platform, one, drone), around, start_ns, seed))
     return cameras

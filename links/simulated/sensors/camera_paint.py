@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from links.simulated.kernels import camera_paint as kernels
-from links.simulated.kernels.camera_paint import BRICK, GLASS, GRASS, LEAF, PAINT, PLAIN, RENDERED, ROAD, SLABS
+from links.simulated.kernels.camera_paint import BRICK, GLASS, GRASS, LEAF, PAINT, PLAIN, PRINT, RENDERED, ROAD, SLABS
 from links.simulated.kernels.ray_casting import Array32
 from links.simulated.world.mesh import SURFACES, Mesh
 from links.simulated.world.procedural import SceneSettings
@@ -43,10 +43,12 @@ MATERIALS: dict[str, tuple[int, tuple[float, float, float], tuple[float, float, 
     "grass": (GRASS, (0.09, 0.15, 0.03), (0.09, 0.15, 0.03)),
     "dark_shell": (PLAIN, (0.03, 0.03, 0.03), (0.03, 0.03, 0.03)),
     "light_shell": (PLAIN, (0.6, 0.6, 0.6), (0.6, 0.6, 0.6)),
+    "print": (PRINT, (0.80, 0.78, 0.70), (0.55, 0.18, 0.10)),
     "marking": (PLAIN, (0.75, 0.75, 0.72), (0.75, 0.75, 0.72)),
 }
 _OBJECT_ENDS = ("roof", "rubber")  # a run of these faces ends an object in a mesh: a building, a car
 _NOISE = noise_tile(np.random.default_rng([20, 1]), falloff=1.1).astype(np.float32)
+NO_MIRROR: Array32 = np.empty((0, 3), dtype=np.float32)
 
 MaterialTable = tuple[NDArray[np.int64], Array32, Array32]
 
@@ -96,8 +98,8 @@ def faces_of(mesh: Mesh) -> Faces:
     ends = np.isin(mesh.surface, [names.index(name) for name in _OBJECT_ENDS if name in names])
     started = np.concatenate([[False], ends[1:] & ~ends[:-1]])
     tint = _hash01(np.cumsum(started))
-    leaf = mesh.surface == names.index("leaf")
-    tint[leaf] = _hash01(np.arange(len(f)) // 2)[leaf]
+    own = mesh.is_surface("leaf", "print")  # each quadrilateral has a colour of its own
+    tint[own] = _hash01(np.arange(len(f)) // 2)[own]
     return Faces(normal.astype(np.float32), mesh.surface, tint.astype(np.float32), half, side)
 
 
@@ -138,15 +140,16 @@ def radiance(
     pixel_rad: float,
     street: Street,
     light: Light,
+    mirrored: Array32 = NO_MIRROR,
 ) -> Array32:
     """Linear RGB (n, 3) of samples: world directions, hit points and normals (n, 3), ranges (n,).
 
     `surface` (n,) is the row of SURFACES, -1 for sky. `window` (n, 4): position on the quadrilateral and its sides [m].
-    `lit` marks the samples in direct sun.
+    `lit` marks the samples in direct sun. `mirrored` (n, 3): what a glossy sample reflects; -1, or empty: the sky.
     """
     return kernels.shade(
         directions, points, normals, ranges, surface, tint, window, lit, pixel_rad, street.numbers(),
         _KIND, _COLOUR, _OTHER, _NOISE,
         light.sun_direction, light.sun_rgb, light.above_rgb, light.below_rgb, light.haze_rgb,
-        light.extinction_per_m, light.sky,
+        light.extinction_per_m, light.sky, mirrored,
     )  # fmt: skip

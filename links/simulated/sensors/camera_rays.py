@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from links.simulated.kernels.camera_rays import (
     FAR_M,
+    LIFT_M,
     describe_hits,
     hit_points,
     rays_into_body,
@@ -21,7 +22,7 @@ from links.simulated.kernels.camera_rays import (
     shadow_rays,
 )
 from links.simulated.kernels.ray_casting import Array32
-from links.simulated.sensors.camera_paint import Faces, Street, faces_of, radiance
+from links.simulated.sensors.camera_paint import NO_MIRROR, Faces, Street, faces_of, radiance
 from links.simulated.world.mesh import SURFACES, Mesh, RayScene
 from links.simulated.world.scene import Body
 from links.simulated.world.sky import Light
@@ -29,6 +30,7 @@ from stages.geometry.frames import Array64
 
 SHADOW_REACH_M = 120.0
 LEAF_ROW = list(SURFACES).index("leaf")
+GLASS_ROW = list(SURFACES).index("glass")
 SKY, WORLD = -1, 0  # bodies are numbered from 1
 
 
@@ -77,7 +79,18 @@ class Samples:
 class CameraScene:
     """Everything a camera can see, prepared for ray casting."""
 
-    def __init__(self, world: RayScene, world_mesh: Mesh, bodies: Sequence[Body], street: Street, light: Light) -> None:
+    def __init__(
+        self,
+        world: RayScene,
+        world_mesh: Mesh,
+        bodies: Sequence[Body],
+        street: Street,
+        light: Light,
+        *,
+        reflections: bool = False,
+    ) -> None:
+        """With `reflections` window glass reflects the static world, otherwise the sky alone."""
+        self._reflections = reflections
         self.bodies = tuple(bodies)
         self.light = light
         self.street = street
@@ -92,6 +105,12 @@ class CameraScene:
         for scene in self.bodies[index].scenes:
             hit &= scene.blocked(origins, directions.astype(np.float32), FAR_M)
         return hit
+
+    def sees_sun(self, origin: Array64, stamp_ns: NDArray[np.int64]) -> bool:
+        """Whether nothing is between a position (3,) and the sun at a time (1,) [ns]."""
+        towards = self.light.sun_direction.astype(np.float32)[None]
+        sample = self.trace(origin.astype(np.float32)[None], towards, np.zeros(1, dtype=np.int64), stamp_ns)
+        return bool(sample.surface[0] < 0)
 
     def trace(
         self,
@@ -120,11 +139,37 @@ class CameraScene:
 
     def radiance(self, samples: Samples, pixel_rad: float) -> Array32:
         """Linear RGB (n, 3)."""
+        return self._shade(samples, pixel_rad, self._mirrored(samples, pixel_rad) if self._reflections else NO_MIRROR)
+
+    def _shade(self, samples: Samples, pixel_rad: float, mirrored: Array32) -> Array32:
         s = samples
         return radiance(
             s.directions, s.points, s.normals, s.ranges, s.surface, s.tint, s.window, s.lit,
-            pixel_rad, self.street, self.light,
+            pixel_rad, self.street, self.light, mirrored,
         )  # fmt: skip
+
+    def _mirrored(self, samples: Samples, pixel_rad: float) -> Array32:
+        """Linear RGB (n, 3) that glass reflects of the static world; -1: the sky, or no glass."""
+        mirrored = np.full((len(samples.surface), 3), -1.0, dtype=np.float32)
+        glass = np.nonzero(samples.surface == GLASS_ROW)[0]
+        if not len(glass):
+            return mirrored
+        d, n = samples.directions[glass], samples.normals[glass]
+        n = n * -np.sign(np.einsum("ni,ni->n", d, n))[:, None].astype(np.float32)
+        reflected = d - 2 * np.einsum("ni,ni->n", d, n)[:, None] * n
+        origins = samples.points[glass] + (LIFT_M + 2e-5 * samples.ranges[glass])[:, None].astype(np.float32) * n
+        found = Samples.empty(len(glass))
+        found.directions = reflected
+        found.ranges, face, u, v = self._world.hits(origins, reflected, FAR_M)
+        found.ranges[face < 0] = np.inf
+        found.describe(np.arange(len(face)), face, u, v, self._world_faces)
+        hit_points(origins, reflected, found.ranges, found.points)
+        if self.light.sun_rgb.any():
+            self._light_samples(found, None)
+        seen = face >= 0
+        found.ranges += samples.ranges[glass]  # the size of a sample and the haze are those of the whole path
+        mirrored[glass[seen]] = self._shade(found, pixel_rad, NO_MIRROR)[seen]
+        return mirrored
 
     def _cast_bodies(
         self, origins: Array32, samples: Samples, moment: NDArray[np.int64], moment_ns: NDArray[np.int64]
@@ -184,14 +229,17 @@ class CameraScene:
             samples.describe(pick, face[nearer], u[nearer], v[nearer], self._faces[index][shape])
             rotate_normals(pick, moment, R, samples.normals)
 
-    def _light_samples(self, samples: Samples, moment_ns: NDArray[np.int64]) -> None:
-        """Mark the samples in direct sun; shadows use the poses of bodies in the middle of the exposure."""
+    def _light_samples(self, samples: Samples, moment_ns: NDArray[np.int64] | None) -> None:
+        """Mark the samples in direct sun; bodies cast shadows as in the middle of the exposure; None: no bodies."""
         sun = self.light.sun_direction
         pick, origins = shadow_rays(
             samples.points, samples.normals, samples.directions, samples.surface, samples.ranges, sun
         )
         towards = np.tile(sun.astype(np.float32), (len(pick), 1))
         dark = self._world.blocked(origins, towards, SHADOW_REACH_M)
+        if moment_ns is None:
+            samples.lit[pick] = ~dark
+            return
         middle_ns = moment_ns[len(moment_ns) // 2 : len(moment_ns) // 2 + 1]
         now = np.zeros(len(pick), dtype=np.int64)
         active, everything = np.ones(1, dtype=np.bool_), np.arange(len(pick))

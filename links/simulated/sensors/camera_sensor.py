@@ -1,7 +1,9 @@
-"""From radiance to JPEG: vignetting, exposure, photon and read noise, gamma.
+"""From radiance to JPEG: vignetting, dirt, lens flare, exposure, photon and read noise, gamma.
 
 Source: EMVA Standard 1288 release 4.0, section 2 (electrons are Poisson, so their variance is their mean; read noise
-adds; full well clips); ITU-R BT.709-style power of 1/2.2 for gamma. Numbers of a small global-shutter sensor.
+adds; full well clips); Hullin et al., ACM Trans. Graphics 30 (2011) 108, for flare (ghosts lie on the line through the
+images of sun and axis; their sizes and strengths, and the dirt, are ours); ITU-R BT.709-style power of 1/2.2 for gamma.
+Numbers of a small global-shutter sensor.
 """
 
 from __future__ import annotations
@@ -21,6 +23,12 @@ from stages.geometry.frames import Array64
 GREY = 0.22  # target of the auto exposure: mean as a fraction of saturation
 ELECTRONS_PER_S = 1e7  # at radiance 1, white in full sun: full well in 1 ms
 GAMMA = 2.2
+GHOSTS = (  # position on the line from the centre to the sun, radius as a share of the image, colour
+    (-0.30, 0.020, (0.6, 1.0, 0.7)),
+    (-0.55, 0.045, (1.0, 0.7, 0.5)),
+    (-0.90, 0.070, (0.5, 0.7, 1.0)),
+    (0.45, 0.030, (0.9, 0.9, 0.6)),
+)
 EDGE_RAD = math.radians(1.5)  # width of the soft rim of the lens
 
 
@@ -53,6 +61,43 @@ def transmission(off_axis_rad: Array64, limit_rad: float, vignetting: float) -> 
     """Fraction of light (n,) that passes the lens: 1 - vignetting (theta / limit)^2, with a soft rim."""
     rim = np.clip((limit_rad - off_axis_rad) / EDGE_RAD, 0.0, 1.0)
     return ((1 - vignetting * (off_axis_rad / limit_rad) ** 2) * rim).astype(np.float32)
+
+
+def dirt(rows: NDArray[np.intp], columns: NDArray[np.intp], size_px: int, spots: int, rng: Generator) -> Array32:
+    """Fraction of light (n,) that passes a dirty lens at pixels: soft spots, and one scratch or hair per four spots."""
+    clean = np.ones(len(rows))
+    for k in range(spots):
+        at, radius = rng.uniform(0.1, 0.9, 2) * size_px, size_px * rng.uniform(0.004, 0.03)
+        x, y = columns - at[0], rows - at[1]
+        if k % 4 == 3:
+            angle, bend = rng.uniform(0, math.pi), rng.normal(0, 0.8)
+            along = x * math.cos(angle) + y * math.sin(angle)
+            across = y * math.cos(angle) - x * math.sin(angle) - bend * along**2 / size_px
+            reach = size_px * rng.uniform(0.03, 0.12)
+            shape = np.exp(-((across / (0.0018 * size_px)) ** 2)) * (np.abs(along) < reach)
+        else:
+            stretch = rng.uniform(0.6, 1.6)
+            shape = np.exp(-((((x * stretch) ** 2 + (y / stretch) ** 2) / radius**2) ** 1.5))
+        clean *= 1.0 - rng.uniform(0.2, 0.7) * shape
+    return clean.astype(np.float32)
+
+
+def flare(image: Array32, sun_px: Array64, centre_px: Array64, strength: float, sun_rgb: Array64) -> None:
+    """Add glare and streaks about the sun's image (2,) column, row, and ghosts, to a radiance image (h, w, 3)."""
+    size = image.shape[0]
+    row, column = np.mgrid[0:size, 0 : image.shape[1]].astype(np.float32)
+    x, y = column - sun_px[0], row - sun_px[1]
+    r = np.hypot(x, y) / size
+    light = 0.8 * np.exp(-r / 0.02) + 0.10 * np.exp(-r / 0.15)
+    for angle in np.radians(np.arange(8.0, 180.0, 30.0)):
+        across = (y * math.cos(angle) - x * math.sin(angle)) / (0.002 * size)
+        light += 0.35 * np.exp(-(across**2)) * np.exp(-r / 0.10)
+    image += strength * light[:, :, None] * sun_rgb.astype(np.float32)
+    for share, radius, rgb in GHOSTS:
+        at = centre_px + share * (sun_px - centre_px)
+        away = np.hypot(column - at[0], row - at[1]) / (radius * size)
+        disc = np.clip(8.0 * (1.0 - away), 0.0, 1.0) * (0.4 + 0.6 * np.minimum(away, 1.0) ** 2)
+        image += 0.12 * strength * disc[:, :, None] * (np.array(rgb) * sun_rgb).astype(np.float32)
 
 
 def develop(

@@ -24,7 +24,7 @@ NS = 1_000_000_000
 
 
 class WheelDriftSettings(DriftSettings):
-    """Drift of wheels and a gyro: less than that of a drone's dead reckoning."""
+    """Drift of wheels and a gyro: less than that of the drone's position by its IMU."""
 
     scale: float = Field(default=0.005, ge=-0.5, le=0.5)
     yaw_rate_deg_per_min: float = Field(default=0.5, ge=-600, le=600)

@@ -45,6 +45,7 @@ SURFACES: dict[str, tuple[float, float]] = {  # name: (diffuse reflectivity, spe
     "dark_shell": (0.06, 0.05),
     "grey_shell": (0.20, 0.05),
     "light_shell": (0.60, 0.10),
+    "print": (0.40, 0.0),
 }
 WET_DIFFUSE = 0.45  # fraction of its diffuse reflectivity that a fully wet, porous surface keeps
 POROUS = ("asphalt", "paving", "kerb", "brick", "plaster", "concrete", "roof", "bark", "grass", "marking")

@@ -6,6 +6,8 @@ acceleration + gravity + drag.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cached_property, partial
 from itertools import pairwise
 from typing import Self
 
@@ -15,6 +17,9 @@ from scipy.interpolate import CubicSpline
 
 from links.simulated.kernels.motion import DRAG_PER_S, GRAVITY_MPS2, evaluate_cubics, rotations_z
 from stages.geometry.frames import Array64
+
+Spline = Callable[[Array64], tuple[Array64, Array64, Array64]]
+"""Value, first and second derivative (n, d) at times (n,)."""
 
 
 class Waypoint(BaseModel):
@@ -50,14 +55,17 @@ class Path(BaseModel):
             raise ValueError("period_s: it must be a multiple of 0.1 s")
         return self
 
-    def at(self, time_s: Array64) -> tuple[Array64, Array64, Array64, Array64]:
-        """Position (n, 3), velocity (n, 3), acceleration (n, 3) and yaw (n,) [rad] at times (n,)."""
+    @cached_property
+    def _spline(self) -> Spline:
         knot_s = np.array([w.t_s for w in self.waypoints])
         knots = np.array([[*w.xyz_m, np.radians(w.yaw_deg)] for w in self.waypoints])
         if self.period_s is None:
-            value, slope, curve = natural_spline(knot_s, knots, time_s)
-        else:
-            value, slope, curve = periodic_spline(knot_s, knots, self.period_s, time_s)
+            return natural_spline(knot_s, knots)
+        return periodic_spline(knot_s, knots, self.period_s)
+
+    def at(self, time_s: Array64) -> tuple[Array64, Array64, Array64, Array64]:
+        """Position (n, 3), velocity (n, 3), acceleration (n, 3) and yaw (n,) [rad] at times (n,)."""
+        value, slope, curve = self._spline(time_s)
         return value[:, :3], slope[:, :3], curve[:, :3], value[:, 3]
 
     def level_poses(self, time_s: Array64) -> tuple[Array64, Array64]:
@@ -76,8 +84,8 @@ class Path(BaseModel):
         return np.stack([np.cross(left, up), left, up], axis=2), position
 
 
-def natural_spline(knot_s: Array64, knots: Array64, time_s: Array64) -> tuple[Array64, Array64, Array64]:
-    """Value, first and second derivative (n, d) at `time_s` of the natural cubic spline through knots (k, d).
+def natural_spline(knot_s: Array64, knots: Array64) -> Spline:
+    """The natural cubic spline through knots (k, d) at times (k,).
 
     With h_i = t_{i+1} - t_i and M the second derivatives (M = 0 at both ends):
     h_{i-1} M_{i-1} + 2 (h_{i-1} + h_i) M_i + h_i M_{i+1} = 6 ((y_{i+1} - y_i) / h_i - (y_i - y_{i-1}) / h_{i-1}).
@@ -85,8 +93,7 @@ def natural_spline(knot_s: Array64, knots: Array64, time_s: Array64) -> tuple[Ar
     """
     count = len(knot_s)
     if count == 1:
-        constant = np.zeros((len(time_s), knots.shape[1]))
-        return constant + knots[0], constant, constant.copy()
+        return partial(_constant, knots[0])
     h = np.diff(knot_s)[:, None]
     chord = np.diff(knots, axis=0) / h
     A = np.eye(count)
@@ -98,12 +105,15 @@ def natural_spline(knot_s: Array64, knots: Array64, time_s: Array64) -> tuple[Ar
     M = np.asarray(np.linalg.solve(A, b), dtype=np.float64)
     linear = chord - h * (2 * M[:-1] + M[1:]) / 6
     cubic = (M[1:] - M[:-1]) / (6 * h)
-    return evaluate_cubics(knot_s, knots, linear, M, cubic, time_s)
+    return partial(evaluate_cubics, knot_s, knots, linear, M, cubic)
 
 
-def periodic_spline(
-    knot_s: Array64, knots: Array64, period_s: float, time_s: Array64
-) -> tuple[Array64, Array64, Array64]:
+def _constant(value: Array64, time_s: Array64) -> tuple[Array64, Array64, Array64]:
+    constant = np.zeros((len(time_s), len(value)))
+    return constant + value, constant, constant.copy()
+
+
+def periodic_spline(knot_s: Array64, knots: Array64, period_s: float) -> Spline:
     """As `natural_spline`, through knots (k, 4) that repeat every `period_s`; the yaw may gain whole turns."""
     turns = 2 * np.pi * np.round((knots[-1, 3] - knots[0, 3]) / (2 * np.pi))
     drift = np.array([0.0, 0.0, 0.0, turns / period_s])
@@ -111,4 +121,8 @@ def periodic_spline(
     closed = np.vstack([knots, knots[0] + drift * period_s]) - drift * closed_s[:, None]
     closed[-1] = closed[0]  # exactly, without rounding
     spline = CubicSpline(closed_s, closed, bc_type="periodic")
+    return partial(_with_drift, spline, drift)
+
+
+def _with_drift(spline: CubicSpline, drift: Array64, time_s: Array64) -> tuple[Array64, Array64, Array64]:
     return spline(time_s) + drift * time_s[:, None], spline(time_s, 1) + drift, spline(time_s, 2)

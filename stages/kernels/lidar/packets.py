@@ -47,7 +47,7 @@ COS_ELEVATION, SIN_ELEVATION, Z_OFFSET_M, AZIMUTH_OFFSET_RAD, TURN_NS, DELAY_NS,
 """Columns of a pulse: TURN_NS is the time by which the rotor has turned on since the block's azimuth was read."""
 
 
-class Rows(NamedTuple):
+class Firings(NamedTuple):
     """Columns of a LidarFirings message: one row per pulse and return."""
 
     pulse_stamp_ns: Integers
@@ -198,7 +198,7 @@ def decode(
                 level = r - origin_m if r > 0.0 else 0.0
                 x = level * cos_elevation[j] * across
                 y = level * cos_elevation[j] * along
-                if origin_m > 0.0 and r > 0.0:  # the beams start beside the axis
+                if origin_m > 0.0 and r > 0.0:  # the beams start at a distance from the axis
                     x += origin_m * sin_block
                     y += origin_m * cos_block
                 xyz_lidar_m[row, np.uint64(0)] = x

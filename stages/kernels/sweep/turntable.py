@@ -13,18 +13,7 @@ from numpy.typing import NDArray
 
 from stages.geometry.frames import Array64
 from stages.kernels.compiled import compiled
-
-
-class Firings(NamedTuple):
-    """A slice of the LiDAR: rows as in `LidarFirings`."""
-
-    stamp_ns: NDArray[np.int64]
-    laser: NDArray[np.uint8]
-    azimuth_rad: NDArray[np.float32]
-    range_m: NDArray[np.float32]
-    reflectivity: NDArray[np.uint8]
-    return_kind: NDArray[np.uint8]
-    xyz_lidar_m: NDArray[np.float32]
+from stages.kernels.lidar.packets import Firings
 
 
 class Returns(NamedTuple):
@@ -134,7 +123,7 @@ def place_slice(
         vy = A[1, 0] * x + A[1, 1] * y + A[1, 2] * z
         vz = A[2, 0] * x + A[2, 1] * y + A[2, 2] * z
         if seen and r >= min_range_m:
-            returns.stamp_ns[n_returns] = firings.stamp_ns[i]
+            returns.stamp_ns[n_returns] = firings.pulse_stamp_ns[i]
             returns.laser[n_returns], returns.reflectivity[n_returns] = firings.laser[i], firings.reflectivity[i]
             returns.turntable_rad[n_returns] = angle
             returns.xyz_m[n_returns, 0] = vx + A[0, 3]
@@ -148,7 +137,7 @@ def place_slice(
         if seen:
             vx, vy, vz = vx + (A[0, 3] - origin[0]), vy + (A[1, 3] - origin[1]), vz + (A[2, 3] - origin[2])
         length = math.sqrt(vx * vx + vy * vy + vz * vz)
-        pulses.stamp_ns[n] = firings.stamp_ns[i]
+        pulses.stamp_ns[n] = firings.pulse_stamp_ns[i]
         pulses.laser[n], pulses.reflectivity[n] = firings.laser[i], firings.reflectivity[i]
         pulses.direction[n, 0], pulses.direction[n, 1], pulses.direction[n, 2] = vx / length, vy / length, vz / length
         pulses.range_m[n] = length if seen else 0.0

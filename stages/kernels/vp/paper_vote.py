@@ -1,4 +1,4 @@
-"""Compiled functions that vote for vanishing directions on a cube, as in the paper.
+"""Compiled functions that vote for vanishing directions, on a cube or in a view's image.
 
 Source: see `stages/vp/paper_vote.py`.
 """
@@ -81,3 +81,50 @@ def fullest(votes: Array64, sums: Array64) -> tuple[Array64, float]:
     if best <= 0.0:
         return direction, 0.0
     return direction / np.sqrt((direction * direction).sum()), best / total
+
+
+@compiled
+def vote_in_image(segments: Array64, side_px: int, cells: int) -> tuple[Array64, Array64]:
+    """Votes (cells, cells) of segments (n, 4) u1, v1, u2, v2 for their intersections inside a square image.
+
+    Returns also the weighted sums of the intersections (cells, cells, 2) u, v. The image ends half a pixel beyond
+    the centres of its first and last pixels; rows are v.
+    """
+    votes = np.zeros((cells, cells))
+    sums = np.zeros((cells, cells, 2))
+    n = len(segments)
+    a, b, c, length = np.empty(n), np.empty(n), np.empty(n), np.empty(n)  # a u + b v = c
+    for i in range(n):
+        du, dv = segments[i, 2] - segments[i, 0], segments[i, 3] - segments[i, 1]
+        length[i] = math.sqrt(du * du + dv * dv)
+        a[i], b[i] = dv / length[i], -du / length[i]
+        c[i] = a[i] * segments[i, 0] + b[i] * segments[i, 1]
+    for i in range(n):
+        for j in range(i + 1, n):
+            sine = a[i] * b[j] - b[i] * a[j]
+            cosine = a[i] * a[j] + b[i] * b[j]
+            weight = length[i] * length[j] * abs(2.0 * sine * cosine)
+            if weight <= 0.0:
+                continue
+            u, v = (c[i] * b[j] - b[i] * c[j]) / sine, (a[i] * c[j] - c[i] * a[j]) / sine
+            row, column = math.floor((v + 0.5) * cells / side_px), math.floor((u + 0.5) * cells / side_px)
+            if not (0 <= row < cells and 0 <= column < cells):
+                continue
+            votes[row, column] += weight
+            sums[row, column, 0] += weight * u
+            sums[row, column, 1] += weight * v
+    return votes, sums
+
+
+@compiled
+def fullest_in_image(votes: Array64, sums: Array64) -> tuple[float, float, float]:
+    """Mean (u, v) [px] of the votes in the fullest cell with its neighbours, and their share of all; share 0: none."""
+    best, u, v, cells = 0.0, 0.0, 0.0, len(votes)
+    for row in range(cells):
+        for column in range(cells):
+            rows, columns = slice(max(row - 1, 0), row + 2), slice(max(column - 1, 0), column + 2)
+            near = votes[rows, columns].sum()
+            if near > best:
+                best = near
+                u, v = sums[rows, columns, 0].sum() / near, sums[rows, columns, 1].sum() / near
+    return u, v, best / votes.sum() if best > 0.0 else 0.0

@@ -9,13 +9,15 @@ a new chain.
 
 The camera is mounted off the drone's centre: the direction of translation is the camera's.
 
-Source: P V.E (5-point); ours: bearing vectors, keyframes, detection of no translation, covariance.
+With a rolling shutter (`readout_ms` of the camera link) and the gyro, rays are those of the middle row's exposure.
+
+Source: P V.E (5-point); ours: rolling shutter, bearing vectors, keyframes, detection of no translation, covariance.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any, ClassVar
 
 import numpy as np
@@ -57,7 +59,7 @@ class FisheyeOdometry(Stage[FisheyeOdometrySettings]):
         self._R_drone_camera: Array64 = settings.T_drone_camera.matrix()[:3, :3]
 
     def on_imu(self, imu: DroneImu) -> None:
-        """The drone's gyro, used only to predict the features' positions in the next image."""
+        """The drone's gyro: predicts the features' positions in the next image, and corrects a rolling shutter."""
         if not self._gyro or imu.stamp_ns > self._gyro[-1][0]:
             self._gyro.append((imu.stamp_ns, imu.angular_velocity_drone_radps))
 
@@ -68,7 +70,8 @@ class FisheyeOdometry(Stage[FisheyeOdometrySettings]):
             gyro.popleft()
         R = gyro_rotation(list(gyro), before_ns, image.stamp_ns) if gyro else None
         C = self._R_drone_camera
-        link = self._links.feed(image.stamp_ns, image.grey, None if R is None else C.T @ R.T @ C)
+        turn = image.rows_after_s() * (C.T @ rate_at_radps(gyro, image.stamp_ns))
+        link = self._links.feed(image.stamp_ns, image.grey, None if R is None else C.T @ R.T @ C, turn)
         if link is None:
             return
         yield followed(link, image.frame_id)
@@ -90,6 +93,12 @@ def visual_motion(link: Link, R_drone_camera: Array64) -> VisualMotion:
         matches=int(np.count_nonzero(link.motion.inlier)),
         reason="no translation observed" if t is None else "",
     )
+
+
+def rate_at_radps(gyro: Iterable[tuple[int, Array64]], stamp_ns: int) -> Array64:
+    """Angular rate (3,) of the nearest gyro sample; zero when none is within `LONGEST_IMU_GAP_NS`."""
+    near_ns, rate = min(gyro, key=lambda sample: abs(sample[0] - stamp_ns), default=(stamp_ns, np.zeros(3)))
+    return rate if abs(near_ns - stamp_ns) <= LONGEST_IMU_GAP_NS else np.zeros(3)
 
 
 def gyro_rotation(gyro: list[tuple[int, Array64]], before_ns: int, now_ns: int) -> Array64 | None:

@@ -24,6 +24,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from stages.geometry.frames import Array64
 from stages.geometry.lens import Equidistant, KannalaBrandt, OCam
+from stages.kernels.geometry.so3 import exp_rotation
 from stages.kernels.visual import patches
 from stages.kernels.visual.features import best_per_cell
 from stages.kernels.visual.patches import Array32, Grey
@@ -37,6 +38,7 @@ BLOCK_PX = 7  # at half size, as wide as a template
 ROUNDNESS = 0.14  # Harris's k: det > k trace^2 excludes edges
 STEPS = 12  # maximum iterations of a Lucas-Kanade level
 STEP_PX = 0.02  # convergence threshold
+NO_TURN: Array64 = np.zeros(3)  # of a camera at rest, or with a global shutter
 
 
 class FeatureSettings(BaseModel):
@@ -93,6 +95,7 @@ class FeatureTracker:
         self._before: Grey | None = None
         self._usable: Grey = np.zeros((0, 0), np.uint8)  # half size, 0: no corner here
         self._next = 0
+        self._turn_rad_per_row: Array64 = NO_TURN
         self._R_map_now: Array64 = np.eye(3)
         self._restart()
 
@@ -103,8 +106,13 @@ class FeatureTracker:
         side = patches.SIDE_PX
         self._templates = _Templates(np.zeros((0, side, side), np.float32), np.zeros((0, 3, 3)))
 
-    def follow(self, stamp_ns: int, grey: Grey, R_now_before: Array64) -> Tracks:
-        """Tracks that are found in the next image. `R_now_before` is the expected rotation."""
+    def follow(self, stamp_ns: int, grey: Grey, R_now_before: Array64, turn_rad_per_row: Array64 = NO_TURN) -> Tracks:
+        """Tracks that are found in the next image. `R_now_before` is the expected rotation.
+
+        `turn_rad_per_row` (3,): rotation of the camera between the exposures of two rows, camera axes. Rays are those
+        of the camera axes at the exposure of the middle row.
+        """
+        self._turn_rad_per_row = turn_rad_per_row
         if self._before is None or grey.shape != self._before.shape:
             if min(grey.shape) < MIN_SIDE_PX:
                 size = f"{grey.shape[1]} x {grey.shape[0]}"
@@ -113,7 +121,7 @@ class FeatureTracker:
             self._usable = usable_pixels(self._lens, self._settings, grey.shape)
         self._R_map_now = self._R_map_now @ R_now_before.T
         kept, pixel = self._track(grey, R_now_before)
-        ray = self._lens.unproject(pixel)
+        ray = self._rays(pixel, grey)
         seen = np.isfinite(ray[:, 0])
         self._templates = self._templates.rows(kept[seen])
         self._tracks = Tracks(stamp_ns, self._tracks.number[kept[seen]], ray[seen], pixel[seen])
@@ -131,7 +139,7 @@ class FeatureTracker:
         worn = np.nonzero(self._stale)[0]
         if s.count - len(t.number) > REFILL * s.count or len(t.number) == 0:
             pixel = self._corners(self._before, t.pixel)
-            ray = self._lens.unproject(pixel)
+            ray = self._rays(pixel, self._before)
             fresh = self._templates_at(pixel)
             number = np.arange(self._next, self._next + len(pixel))
             self._next += len(pixel)
@@ -148,6 +156,13 @@ class FeatureTracker:
             self._templates.patch[worn], self._templates.ray[worn] = again.patch, again.ray
         self._stale = np.zeros(len(t.number), np.bool_)
         return t
+
+    def _rays(self, pixel: Array64, grey: Grey) -> Array64:
+        """Rays (n, 3) of pixels (n, 2) at the exposure of the middle row; NaN outside the lens."""
+        ray = self._lens.unproject(pixel)
+        if not self._turn_rad_per_row.any():
+            return ray
+        return at_middle_row(ray, pixel[:, 1] - 0.5 * (grey.shape[0] - 1), self._turn_rad_per_row)
 
     def drop(self, number: NDArray[np.int64]) -> None:
         """Drop tracks of the newest image, because they are on moving objects."""
@@ -197,6 +212,12 @@ class FeatureTracker:
         cell = max(math.sqrt(np.count_nonzero(self._usable) / s.count), 4.0)
         pixel = best_per_cell(strength, self._usable, (taken + 0.5) / HALF - 0.5, cell, s.min_contrast)
         return HALF * pixel  # whole pixels: templates need no interpolation
+
+
+def at_middle_row(ray: Array64, rows_after: Array64, turn_rad_per_row: Array64) -> Array64:
+    """Rays (n, 3) of rows exposed `rows_after` (n,) the middle one, in the camera axes of the middle row."""
+    turns = rows_after[:, None] * turn_rad_per_row
+    return np.array([exp_rotation(turn) @ r for turn, r in zip(turns, ray, strict=True)]).reshape(-1, 3)
 
 
 def usable_pixels(lens: Equidistant | KannalaBrandt | OCam, settings: FeatureSettings, shape: tuple[int, int]) -> Grey:

@@ -22,7 +22,7 @@ from stages.kernels.geometry.so3 import exp_rotation, log_rotation
 from stages.kernels.visual.epipolar import epipolar
 from stages.kernels.visual.patches import Grey
 from stages.messages import FollowedFeatures
-from stages.odometry.visual.features import FeatureSettings, FeatureTracker, Tracks
+from stages.odometry.visual.features import NO_TURN, FeatureSettings, FeatureTracker, Tracks
 from stages.odometry.visual.two_view import LEAST, Noise, TwoView, backwards, relative_motion
 
 RETURN_RAD = math.radians(1.0)  # above this parallax the camera cannot have returned to the key position
@@ -99,10 +99,13 @@ class MotionLinks:
         """The key image of the next motion, with all its tracks."""
         return self._key
 
-    def feed(self, stamp_ns: int, grey: Grey, R_now_before: Array64 | None = None) -> Link | None:
+    def feed(
+        self, stamp_ns: int, grey: Grey, R_now_before: Array64 | None = None, turn_rad_per_row: Array64 = NO_TURN
+    ) -> Link | None:
         """The motion since the key image; None for the first image or when tracking fails (`reason`).
 
         `R_now_before`: the gyro's rotation since the previous image; without it the last angular rate is extrapolated.
+        `turn_rad_per_row` (3,): rotation between the exposures of two rows of a rolling shutter, camera axes.
         """
         key, s = self._key, self._settings
         step_s = (stamp_ns - self._before_ns) * 1e-9
@@ -112,7 +115,7 @@ class MotionLinks:
         expected = exp_rotation(-self._rate_radps * step_s) if R_now_before is None else R_now_before
         if key is None or step_s > LONGEST_STEP_S:
             expected = np.eye(3)
-        now = self._tracker.follow(stamp_ns, grey, expected)
+        now = self._tracker.follow(stamp_ns, grey, expected, turn_rad_per_row)
         self._before_ns = stamp_ns
         if key is None:
             return self._restart("first image")

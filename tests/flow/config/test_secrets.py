@@ -10,7 +10,7 @@ import pytest
 from flow.config.secrets import without_secrets
 from flow.graph import load_graph
 from links.recording import RecordingReader
-from tests.links import command
+from tests import command
 
 PASSWORD = "hunter2"
 CONFIG = f"""\

@@ -16,7 +16,7 @@ from links.calibration.gather import checked_rig, lidar_of
 from links.cli.files import read_rig
 from links.recording import RecordingReader, RecordingWriter
 from stages.geometry.rig_lidar import RigLidar
-from tests.links import command
+from tests import command
 
 ROOT = Path(__file__).resolve().parents[3]
 STREET = ROOT / "recordings" / "street_sweep.mcap"

@@ -3,7 +3,7 @@
     python -m pytest -m slow -s tests/links/calibration/test_calibration_scenes.py
 
 Each sweep is that of configs/scenarios/calibrate.yaml. The turntable's axis is tilted by up to 1 deg, the servo's stamps
-are off by up to 5 ms, its encoder by .1 to .4 deg, its gear has play; the file knows nothing of it.
+are off by up to 5 ms, its encoder by 0.1 to 0.4 deg, its gear has play; the file knows nothing of it.
 """
 
 from __future__ import annotations

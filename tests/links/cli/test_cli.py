@@ -18,7 +18,7 @@ from flow.subprocess_replay import can_use_subprocesses
 from links.cli.app import COMMANDS
 from links.cli.app import command as command_named
 from links.cli.files import read_rig
-from tests.links import command
+from tests import command
 
 ROOT = Path(__file__).resolve().parents[3]
 STREET = ROOT / "recordings" / "street_sweep.mcap"
@@ -102,7 +102,7 @@ def test_a_run_without_a_fuse_stage_prints_the_positions_of_the_drone(grd, tmp_p
     assert "fused" not in text
 
 
-def test_a_second_configuration_is_run_on_the_same_recording_and_printed_beside_the_first(grd, tmp_path):
+def test_a_second_configuration_is_run_on_the_same_recording_and_printed_next_to_the_first(grd, tmp_path):
     (tmp_path / "one.yaml").write_text(
         f"include: {ROOT}/configs/replay.yaml\nreplay: {STREET}\nlinks: {{viewer: null}}\n"
     )
@@ -124,7 +124,7 @@ def test_a_live_configuration_has_nothing_to_be_run_against(grd):
 
 
 @pytest.mark.slow
-def test_the_quickstart_reaches_the_whole_pose_beside_the_paper_which_does_not(grd, tmp_path):
+def test_the_quickstart_reaches_the_whole_pose_and_the_paper_does_not(grd, tmp_path):
     text = grd("run", "quickstart", "--against", "quickstart_paper")
     summary = json.loads((tmp_path / "out" / "experiment_1-quickstart" / "summary.json").read_text())
     assert summary["recorded_s"] >= 30

@@ -155,4 +155,4 @@ def test_the_committed_hosts_file_assigns_all_nodes_of_the_field_configuration()
     done = grd("check", field, "--hosts", ROOT / "deploy" / "hosts.yaml")
     assert done.exit_code == 0, done.output
     assert "drone: runs camera_drone, drone_odometry, vp_drone" in done.output
-    assert "image" not in done.output.partition("vehicle, the hub")[2], "no pictures cross"
+    assert "image" not in done.output.partition("vehicle, the hub")[2], "no images cross"

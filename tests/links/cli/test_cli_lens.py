@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from flow.graph import load_graph
-from tests.links import command
+from tests import command
 from tests.stages.geometry.test_lens import KANNALA_BRANDT, OCAM
 from tests.stages.geometry.test_lens_files import KALIBR, OCAMCALIB
 from tests.test_architecture import ROOT
@@ -81,5 +81,5 @@ def test_an_existing_file_is_overwritten_on_request_only_and_the_calibration_nev
     grd("lens", "camchain.yaml", "drone")
     assert "--overwrite" in grd("lens", "camchain.yaml", "drone", code=2)
     grd("lens", "camchain.yaml", "drone", "--overwrite")
-    assert "name another" in grd("lens", "camchain.yaml", "drone", "-o", "camchain.yaml", "--overwrite", code=2)
+    assert "give another name" in grd("lens", "camchain.yaml", "drone", "-o", "camchain.yaml", "--overwrite", code=2)
     assert (tmp_path / "camchain.yaml").read_text() == KALIBR

@@ -20,7 +20,7 @@ from links.recording import Recorder, RecordingReader, recover
 from links.runs.live_run import live_graph, run_live
 from links.runs.request import RunRequest
 from links.runs.run_folder import RunFolder
-from tests.links import command
+from tests import command
 
 ROOT = Path(__file__).resolve().parents[3]
 PATIENCE_S = 120.0

@@ -9,7 +9,7 @@ import pytest
 
 from flow.link import Record
 from links.recording import RecordingWriter
-from tests.links import command
+from tests import command
 
 ROOT = Path(__file__).resolve().parents[3]
 CONFIG = """\

@@ -149,9 +149,9 @@ def test_a_source_has_its_rate_the_age_of_its_newest_record_and_its_status():
 def test_what_is_sent_to_the_autopilot_and_what_is_held_back_is_shown():
     report = report_of()
     assert "autopilot" not in shown(report, terminal=True)
-    report.counters["autopilot"] = Counters({"pose rejected: no yaw": 12, "sent: HEARTBEAT": 9})
+    report.counters["autopilot"] = Counters(groups={"pose rejected": {"no yaw": 12}, "sent": {"HEARTBEAT": 9}})
     assert "to the autopilot: nothing sent; held back: no yaw 12" in shown(report, terminal=True)
-    report.counters["autopilot"] = Counters({"pose rejected: no yaw": 12, "sent: ODOMETRY": 70})
+    report.counters["autopilot"] = Counters(groups={"pose rejected": {"no yaw": 12}, "sent": {"ODOMETRY": 70}})
     assert "to the autopilot: ODOMETRY 70; held back: no yaw 12" in shown(report, terminal=True)
 
 
@@ -161,7 +161,7 @@ def test_the_screen_of_a_bad_day_fits_24_rows_of_80_columns():
         report.links[f"source_{n}"] = LinkReport(LinkState.FAILED, 0, 1, reason="no packet on UDP 2368: " + "x" * 200)
         report.edges[f"stage_{n}.input"] = report.edges["track.pulses"]
         report.counters[f"stage_{n}"] = Counters({}, {"y" * 200: 3})
-    report.counters["autopilot"] = Counters({"pose rejected: no yaw": 12, "sent: ODOMETRY": 70})
+    report.counters["autopilot"] = Counters(groups={"pose rejected": {"no yaw": 12}, "sent": {"ODOMETRY": 70}})
     stream = io.StringIO()
     console = Console(file=stream, force_terminal=True, width=80, highlight=False, soft_wrap=True)
     with LiveView(console) as view:

@@ -11,7 +11,7 @@ from flow.graph import load_graph
 from links import __version__
 from links.preflight.shipped_values import shipped_values
 from links.runs.shipped import CONFIGS, RECORDINGS, shipped
-from tests.links import command
+from tests import command
 
 QUIET = """\
 include: field.yaml

@@ -22,7 +22,7 @@ from links.runs.truth import TruthLog
 from stages.geometry.frames import quaternions_xyzw, rotation_from_rpy_deg, rotation_z
 from stages.kernels.geometry.so3 import exp_rotation
 from stages.messages import BranchState, RelativeRotation
-from tests.links.command import grd
+from tests.command import grd
 from tests.links.evaluation.made_runs import (
     add_rotations,
     add_true_rotations,

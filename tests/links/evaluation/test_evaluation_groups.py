@@ -22,7 +22,7 @@ from links.evaluation.groups import (
 )
 from links.evaluation.run_data import OutputKind, read_run
 from links.evaluation.tables import median_columns, medians, runs_table
-from tests.links.command import grd
+from tests.command import grd
 from tests.links.evaluation.made_runs import add_pose, all_evaluated, evaluated, make_run, truth_at, yaw_quaternion
 
 T_S = np.arange(0.0, 10.0, 0.1)
@@ -211,7 +211,7 @@ def test_one_row_for_each_configuration_is_the_table_of_ablations(two_configs):
             ["track.use_pass_throughs=false", "viewer.file=null"],
             "estimate track.use_pass_throughs=false",
         ),
-        ("flight-1-without_misses", ["track.use_pass_throughs=false"], "without_misses"),
+        ("flight-1-no_pass_throughs", ["track.use_pass_throughs=false"], "no_pass_throughs"),
         ("anything", ["track.use_pass_throughs=false"], "estimate track.use_pass_throughs=false"),
     ],
 )

@@ -10,7 +10,7 @@ from links.evaluation.groups import probability_score_table, probability_scores,
 from links.evaluation.run_data import read_run
 from links.runs.results import CANDIDATES_FILE, Results
 from stages.messages import CandidateLog
-from tests.links.command import grd
+from tests.command import grd
 from tests.links.evaluation.made_runs import all_evaluated, lines, make_run, stamp, truth_at
 
 HEAD = "stamp_s,candidate,detector_instance,observations,probability,x_m,y_m,z_m\n"

@@ -18,7 +18,7 @@ from flow.link import LinkError
 from links.evaluation.comparison import pair_up
 from links.evaluation.figures import MAX_POINTS, worst_of_each
 from links.evaluation.tables import medians, ranks
-from tests.links.command import grd
+from tests.command import grd
 from tests.links.evaluation.made_runs import add_pose, evaluated, lines, make_run, truth_at
 
 EIGHT_HZ = np.arange(0.0, 10.0, 0.125)

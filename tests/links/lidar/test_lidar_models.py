@@ -77,7 +77,7 @@ def test_every_point_of_a_hesai_scan_is_that_of_an_independent_decoder(name, poi
     assert (lidar.counters["lost"], lidar.counters.rejected) == (0, {})
 
 
-def test_a_hesai_tells_its_model_and_the_wrong_profile_is_refused():
+def test_a_hesai_packet_has_its_model_and_the_wrong_profile_is_refused():
     first = next(hesai_records("xt16"))
     assert recognised_model(first.data) == "XT16"
     for wrong in ("XT32", "VLP-16"):

@@ -162,7 +162,7 @@ def test_a_disk_that_gets_full_ends_the_recording_properly_and_room_again_begins
         assert reader.finished
 
 
-def test_a_disk_that_is_gone_is_said_and_the_recording_goes_on_when_it_is_back(tmp_path, monkeypatch):
+def test_a_disk_that_is_gone_is_reported_and_the_recording_goes_on_when_it_is_back(tmp_path, monkeypatch):
     monkeypatch.setattr("links.recording.recorder.RETRY_S", 0.0)
     recorder = opened(tmp_path)
 

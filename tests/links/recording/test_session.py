@@ -13,7 +13,7 @@ from flow.link import LinkError
 from flow.live.input_order import END_TOPIC
 from links.calibration.gather import gather
 from links.recording import RecordingReader, Session
-from tests.links import command
+from tests import command
 from tests.links.recording.split import split
 
 ROOT = Path(__file__).resolve().parents[3]

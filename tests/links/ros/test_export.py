@@ -79,10 +79,10 @@ def test_an_exported_recording_is_read_back_with_equal_values(tmp_path: Path):
     assert [m.velocity[0] for _, m in bag["/joint_states"]] == [s["velocity_radps"] for s in states]
 
     for camera in ("vehicle", "drone"):
-        pictures = of(records, f"/camera/{camera}")
+        images = of(records, f"/camera/{camera}")
         exported = bag[f"/camera/{camera}/compressed"]
-        assert len(exported) == len(pictures) > 0
-        for (time_ns, m), r in zip(exported, pictures, strict=True):
+        assert len(exported) == len(images) > 0
+        for (time_ns, m), r in zip(exported, images, strict=True):
             image = decode_compressed_image(r.data)
             assert (time_ns, stamp_ns(m), m.header.frame_id) == (r.arrival_ns, r.stamp_ns, f"camera_{camera}")
             assert (m.format, m.data.tobytes()) == ("jpeg", image.data)

@@ -180,8 +180,8 @@ def test_an_ouster_is_known_by_the_metadata_in_the_bag_and_refused_without(tmp_p
     kind = "ouster_sensor_msgs/msg/PacketMsg"
     entries: list[Entry] = [("/ouster/lidar_packets", kind, d.time_ns, {"buf": list(d.payload)}) for d in datagrams]
     metadata = name.with_name(f"{name.name}.json").read_text()
-    told: Entry = ("/ouster/metadata", STRING, datagrams[0].time_ns, {"data": metadata})
-    report, records, rig_yaml = imported(tmp_path, write_bag(tmp_path / "with", [told, *entries]))
+    metadata_entry: Entry = ("/ouster/metadata", STRING, datagrams[0].time_ns, {"data": metadata})
+    report, records, rig_yaml = imported(tmp_path, write_bag(tmp_path / "with", [metadata_entry, *entries]))
     assert rig_yaml is not None
     unit = rig_unit(rig_yaml, "test")
     assert (unit.model, unit.mount.turns) == ("OS0-32", False)
@@ -190,10 +190,12 @@ def test_an_ouster_is_known_by_the_metadata_in_the_bag_and_refused_without(tmp_p
     assert "no metadata: give the sensor's with --rig" in refused(bag, tmp_path)
     other = metadata.replace('"prod_sn": "', '"prod_sn": "9')
     assert other != metadata
-    told = ("/ouster/metadata", STRING, datagrams[0].time_ns, {"data": other})
-    assert "serial number" in refused(write_bag(tmp_path / "other", [told, *entries]), tmp_path)
-    told = ("/ouster/metadata", STRING, datagrams[0].time_ns, {"data": "{}"})
-    assert "not the metadata of an Ouster" in refused(write_bag(tmp_path / "empty", [told, *entries]), tmp_path)
+    metadata_entry = ("/ouster/metadata", STRING, datagrams[0].time_ns, {"data": other})
+    assert "serial number" in refused(write_bag(tmp_path / "other", [metadata_entry, *entries]), tmp_path)
+    metadata_entry = ("/ouster/metadata", STRING, datagrams[0].time_ns, {"data": "{}"})
+    assert "not the metadata of an Ouster" in refused(
+        write_bag(tmp_path / "empty", [metadata_entry, *entries]), tmp_path
+    )
 
 
 def test_the_rigs_model_must_be_the_packets(tmp_path: Path):
@@ -282,14 +284,14 @@ def test_a_float_becomes_the_servo(tmp_path: Path, kind: str, unit: str, expecte
 # ---- cameras
 
 
-def picture(height: int = 24, width: int = 32) -> np.ndarray:
+def photo(height: int = 24, width: int = 32) -> np.ndarray:
     rows, columns = np.mgrid[0:height, 0:width]
     return np.stack([rows * 8, columns * 7, rows + columns], axis=2).astype(np.uint8)
 
 
 @pytest.mark.parametrize("encoding", ["bgr8", "rgb8", "bgra8", "mono8"])
 def test_a_raw_image_becomes_jpeg(tmp_path: Path, encoding: str):
-    bgr = picture()
+    bgr = photo()
     pixels = {
         "bgr8": bgr,
         "rgb8": bgr[..., ::-1],
@@ -318,7 +320,7 @@ def test_a_raw_image_becomes_jpeg(tmp_path: Path, encoding: str):
 
 
 def test_a_compressed_image_is_kept_as_it_is_and_png_becomes_jpeg(tmp_path: Path):
-    jpeg, png = (cv2.imencode(kind, picture())[1].tobytes() for kind in (".jpg", ".png"))
+    jpeg, png = (cv2.imencode(kind, photo())[1].tobytes() for kind in (".jpg", ".png"))
     kind = "sensor_msgs/msg/CompressedImage"
 
     def bag(data: bytes, name: str) -> Path:

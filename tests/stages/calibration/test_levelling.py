@@ -12,7 +12,7 @@ from stages.calibration.levelling import Standing, stand
 from stages.geometry.frames import rotation_from_rpy_deg
 from tests.stages.calibration.made_sweep import GROUND, RIG, sweep, wrong_mount
 
-SAID = math.radians(0.15)
+STATED_RAD = math.radians(0.15)
 ENDS = ((1.0, 0.0, 0.0, 14.0), (-1.0, 0.0, 0.0, 16.0))
 WALLS = ((0.0, 1.0, 0.0, 5.0), (0.0, -1.0, 0.0, 9.0))  # parallel to the vehicle
 TILT_DEG = (1.2, -0.8)
@@ -57,7 +57,7 @@ def off_deg(true, found):
 
 @pytest.mark.parametrize("zero_deg", [0.5, -0.5])
 def test_a_wall_next_to_the_vehicle_determines_the_zero(zero_deg):
-    true, found = found_in((*GROUND, *WALLS, *ENDS), zero_deg, parallel_rad=SAID)
+    true, found = found_in((*GROUND, *WALLS, *ENDS), zero_deg, parallel_rad=STATED_RAD)
     result = finding(found, "zero")
     assert result.rejected == ""
     assert abs(off_deg(true, found)) < 0.05
@@ -79,7 +79,7 @@ def test_without_a_stated_orientation_nothing_changes():
 
 def test_an_angle_to_the_wall_is_in_the_zero_and_within_its_sigma():
     askew = [turned(wall, 0.2) for wall in WALLS]
-    true, found = found_in((*GROUND, *askew, *ENDS), parallel_rad=SAID)
+    true, found = found_in((*GROUND, *askew, *ENDS), parallel_rad=STATED_RAD)
     assert off_deg(true, found) == pytest.approx(-0.2, abs=0.05)
     assert abs(off_deg(true, found)) < 2 * finding(found, "zero").sigma
 
@@ -94,7 +94,7 @@ def test_an_angle_to_the_wall_is_in_the_zero_and_within_its_sigma():
     ],
 )
 def test_unsuitable_walls_are_rejected(planes, why):
-    _, found = found_in((*GROUND, *planes, *ENDS), parallel_rad=SAID)
+    _, found = found_in((*GROUND, *planes, *ENDS), parallel_rad=STATED_RAD)
     before = found_in((*GROUND, *planes, *ENDS))[1]
     assert why in finding(found, "zero").rejected
     assert found.mount == before.mount
@@ -106,7 +106,7 @@ def test_an_orientation_less_accurate_than_an_uncalibrated_rig_is_rejected():
 
 
 def test_the_ground_determines_the_tilt_of_the_axis_but_not_the_zero():
-    true, found = found_in((*GROUND, *WALLS, *ENDS), tilt_deg=TILT_DEG, level_rad=SAID)
+    true, found = found_in((*GROUND, *WALLS, *ENDS), tilt_deg=TILT_DEG, level_rad=STATED_RAD)
     R = found.mount.T_vehicle_turntable.matrix()[:3, :3]
     off = R @ rotation_from_rpy_deg((*TILT_DEG, 0.0)).T
     assert math.degrees(math.hypot(off[0, 2], off[1, 2])) < 0.05
@@ -118,32 +118,32 @@ def test_the_ground_determines_the_tilt_of_the_axis_but_not_the_zero():
 
 
 def test_ground_and_wall_together_determine_the_zero_of_a_tilted_axis():
-    true, found = found_in((*GROUND, *WALLS, *ENDS), tilt_deg=TILT_DEG, level_rad=SAID, parallel_rad=SAID)
+    true, found = found_in((*GROUND, *WALLS, *ENDS), tilt_deg=TILT_DEG, level_rad=STATED_RAD, parallel_rad=STATED_RAD)
     assert finding(found, "zero").rejected == ""
     assert abs(off_deg(true, found)) < 0.06
 
 
 def test_an_even_slope_counts_as_level():
     """The statement is about the ground around the vehicle: its wheels stand on the same slope."""
-    _, found = found_in((sloped(3.0), *WALLS, *ENDS), tilt_deg=(3.0, 0.0), level_rad=SAID)
+    _, found = found_in((sloped(3.0), *WALLS, *ENDS), tilt_deg=(3.0, 0.0), level_rad=STATED_RAD)
     assert finding(found, "level_x").rejected == ""
     assert finding(found, "level_x").after == pytest.approx(0.0, abs=0.05)
 
 
 @pytest.mark.parametrize("rises_deg", [4.0, 8.0])
 def test_curved_ground_is_rejected(rises_deg):
-    _, found = found_in((sloped(rises_deg), sloped(-rises_deg), *WALLS, *ENDS), level_rad=SAID)
+    _, found = found_in((sloped(rises_deg), sloped(-rises_deg), *WALLS, *ENDS), level_rad=STATED_RAD)
     assert finding(found, "level_x").rejected
     assert found.mount.T_vehicle_turntable == RIG.T_vehicle_turntable
 
 
 def test_a_slope_next_to_the_vehicle_is_rejected_or_in_the_sigma():
     for rises_deg in (0.4, 1.0, 2.0, 4.0):
-        _, found = found_in((*GROUND, sloped(rises_deg), *WALLS, *ENDS), level_rad=SAID)
+        _, found = found_in((*GROUND, sloped(rises_deg), *WALLS, *ENDS), level_rad=STATED_RAD)
         result = finding(found, "level_x")
         assert result.rejected or abs(result.after) < 2 * result.sigma
 
 
 def test_ground_that_was_not_observed_around_the_vehicle_is_rejected():
-    _, found = found_in((*WALLS, *ENDS), level_rad=SAID)
+    _, found = found_in((*WALLS, *ENDS), level_rad=STATED_RAD)
     assert "too little of the ground" in finding(found, "level_x").rejected

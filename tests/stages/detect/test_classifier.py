@@ -202,13 +202,13 @@ def test_telemetry_of_a_hovering_drone_is_no_motion(log_ratio):
 
 def test_over_static_objects_telemetry_replaces_the_motion_term():
     silent, nothing, flew = hovering(), hovering(NO_EVIDENCE), hovering(log_ratios_of(20.0, 0.0, 0.0, 20.0))
-    (log_odds, remarks, _), (same, same_said, _), (more, more_said, _) = (
+    (log_odds, remarks, _), (same, same_remarks, _), (more, more_remarks, _) = (
         over_clutter(c, E, False, True) for c in (silent, nothing, flew)
     )
     assert same == pytest.approx(log_odds)
-    assert remarks == same_said
+    assert remarks == same_remarks
     assert "it may be static" in remarks
-    assert "it may be static" not in more_said
+    assert "it may be static" not in more_remarks
     assert more == pytest.approx(log_odds - E.static * 12 + E.max_telemetry)
     moved = candidate(*path((2.0, 0.0, 0.0), count=12))
     silently, *_ = over_clutter(moved, E, False, True)
@@ -315,10 +315,10 @@ def test_at_long_range_a_candidate_that_follows_the_odometry_is_no_wire():
         assert ("it may be static" in over_clutter(little, E, False, True)[1]) == still
 
 
-def come_to_a_wall(*told_on_the_way):
+def come_to_a_wall(*log_ratios_on_the_way):
     """A drone that hovers next to a wall after a flight that followed the odometry."""
     c = hovering()
-    for log_ratio in told_on_the_way:
+    for log_ratio in log_ratios_on_the_way:
         c.add_log_ratios(log_ratio)
     c.neighbour_score = 10.0
     c.add_log_ratios(NO_EVIDENCE)

@@ -229,8 +229,8 @@ def test_a_hovering_drone_at_close_range_is_accepted_once_a_support_would_be_vis
     candidates, detections = run([hovering(seed)], 4.2)
     assert 1.0 < accepted_after_s(detections) < 3.0
     assert "it may be static" in candidates[-1].reasons[0]
-    _, told_to_doubt = run([hovering(seed)], 4.2, weights={"max_isolated_near": 0.0})
-    assert accepted_after_s(told_to_doubt) == math.inf
+    _, detections = run([hovering(seed)], 4.2, weights={"max_isolated_near": 0.0})
+    assert accepted_after_s(detections) == math.inf
 
 
 def test_candidates_name_the_detector_instance():
@@ -788,15 +788,15 @@ def test_a_trained_model_is_refused_for_another_lidar():
 def test_a_rejected_lamp_is_not_published_again_while_the_drone_flies():
     """It is observed in each pass; another observation takes time from the drone."""
 
-    def told_again(trajectory, reacquired):
+    def published(trajectory, reacquired):
         stage = EvidenceDetect(sweep_deg=PASS_DEG, weights=ClassifierWeights(revisited=reacquired))
         stage._now.rejected_map.add(np.array([PLACE_M]), START_NS)
         candidates, _ = run([hovering()], 0.5, publish=telemetry_of(trajectory), stage=stage)
         return sum(c.candidate_id.size > 0 for c in candidates)
 
     flies = flying((0.0, 0.0, 0.0), (3.0, 0.0, 0.0))
-    assert told_again(flies, 4.0) == 0 < told_again(flies, 0.0)
-    assert told_again(still(0.0, 0.0, 0.0), 4.0) > 0
+    assert published(flies, 4.0) == 0 < published(flies, 0.0)
+    assert published(still(0.0, 0.0, 0.0), 4.0) > 0
 
 
 @pytest.mark.parametrize(("step_m", "remembered"), [(0.0, True), (0.5, False)])

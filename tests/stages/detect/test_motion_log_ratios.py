@@ -48,9 +48,9 @@ def noise(seed=0, sigma_m=0.1, n=14):
     return np.random.default_rng(seed).normal(0.0, sigma_m, (n, 3))
 
 
-def against(path_m, told_m, level_known=True, t_s=T_S, sigma_m=SIGMA_M):
+def against(path_m, odometry_m, level_known=True, t_s=T_S, sigma_m=SIGMA_M):
     return MotionLogRatios(
-        *weigh(t_s, np.asarray(path_m), np.asarray(told_m), sigma_m, level_known), displacement_m=math.inf
+        *weigh(t_s, np.asarray(path_m), np.asarray(odometry_m), sigma_m, level_known), displacement_m=math.inf
     )
 
 

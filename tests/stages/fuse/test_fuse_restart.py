@@ -58,7 +58,7 @@ def test_a_prior_that_comes_after_the_first_positions_is_used_too():
     assert hover(from_s=2.0).decided_s < 10.0
 
 
-def test_a_prior_whose_position_is_elsewhere_does_not_decide():
+def test_a_prior_at_another_position_does_not_decide():
     flown = hover(moved_m=6.0, turned_deg=90.0)
     assert not any(flown.full)
 

@@ -91,7 +91,7 @@ def jumped(from_s, deg=115.0):
 
 
 @pytest.mark.parametrize("silent_s", [0.0, 1.5])
-def test_a_jump_of_the_map_frame_starts_anew(driving, silent_s):
+def test_a_jump_of_the_map_frame_resets_the_estimate(driving, silent_s):
     """Relative to the vehicle no pose is wrong, in the new frame either."""
     gap, jump = without(("motion",), 6.0, 6.0 + silent_s), jumped(6.0)
     flown = fly(driving, fault=lambda events: jump(gap(events)), frame=VEHICLE)

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from stages.geometry.frames import heading_rad, rotation_z
 from stages.kernels.geometry.so3 import exp_rotation, hat, log_rotation, nearest_rotation, nearly_rotation
 
 
@@ -36,3 +37,10 @@ def test_nearly_a_rotation_or_not_the_nearest_is_found(share):
         turned = R @ exp_rotation(angle_rad * np.array([0.6, -0.48, 0.64]))
         M = R + share * (turned - R)
         np.testing.assert_allclose(nearly_rotation(M), nearest_rotation(M), atol=1e-12)
+
+
+@pytest.mark.parametrize("yaw", [-3.0, 0.0, 2.5])
+def test_the_heading_of_a_nearly_level_rotation(yaw):
+    assert math.remainder(heading_rad(rotation_z(yaw)) - yaw, 2 * math.pi) == pytest.approx(0, abs=1e-12)
+    tilted = rotation_z(yaw) @ exp_rotation(np.array([0.02, -0.03, 0.0]))
+    assert math.remainder(heading_rad(tilted) - yaw, 2 * math.pi) == pytest.approx(0, abs=0.002)

@@ -78,7 +78,7 @@ def test_evidence_never_exceeds_the_share_of_wrong_compasses():
     assert math.isclose(far / here, 0.03 / (0.97 * density + 0.03), rel_tol=1e-3)
 
 
-def test_evidence_narrows_a_yaw_that_is_not_known_and_keeps_the_wrong_compass_beside_it():
+def test_evidence_narrows_a_yaw_that_is_not_known_and_keeps_the_wrong_compass_as_a_hypothesis():
     evidence = odometry_heading().evidence(round(2.4 * S), rotation_z(-0.3))
     assert evidence is not None
     wide = YawMixture(2 * math.pi / 12 * np.arange(12), np.full(12, math.radians(18.0) ** 2), np.full(12, 1 / 12))

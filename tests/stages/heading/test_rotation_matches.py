@@ -94,7 +94,7 @@ def test_matches_that_later_images_contradict_leave_the_free_hypotheses_alone():
     assert near(heading.bank, 60.0) == pytest.approx(0.9, abs=0.05)
 
 
-def test_a_street_15_deg_beside_that_of_the_cameras_keeps_the_heading_undecided():
+def test_a_street_15_deg_from_that_of_the_cameras_keeps_the_heading_undecided():
     """Without cameras yaws within 20 deg of each other count as the same."""
     near_probability = {}
     for tied in (True, False):

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import importlib
+import inspect
+import pkgutil
 import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 from numba.core import config
+from numba.core.registry import CPUDispatcher
 
+import links.simulated.kernels
+import stages.kernels
 from flow.compile_cache import cache_folder, cache_name
+from stages.kernels import compiled
 from stages.kernels.compiled import CACHE_FOLDER, COMPILED
 
 REPOSITORY = Path(__file__).resolve().parents[3]
@@ -32,6 +40,17 @@ def test_every_compiled_function_is_in_a_folder_of_the_name():
     assert [path for path in users if not any(REPOSITORY / folder in path.parents for folder in COMPILED)] == []
 
 
+@pytest.mark.parametrize("kernels", [links.simulated.kernels, stages.kernels])
+def test_kernels_define_compiled_functions_only(kernels):
+    for module in pkgutil.walk_packages(kernels.__path__, f"{kernels.__name__}."):
+        loaded = importlib.import_module(module.name)
+        own = [value for value in vars(loaded).values() if getattr(value, "__module__", None) == module.name]
+        assert own or module.ispkg, module.name
+        functions = [value for value in own if callable(value) and not inspect.isclass(value)]
+        if loaded is not compiled:  # the decorators themselves
+            assert all(isinstance(value, CPUDispatcher) for value in functions), module.name
+
+
 def test_numba_uses_it_and_a_folder_that_cannot_be_created_is_no_error(tmp_path, monkeypatch):
     assert str(CACHE_FOLDER) == config.CACHE_DIR
     (tmp_path / "file").write_text("")
@@ -49,9 +68,9 @@ def test_a_changed_callee_in_another_file_is_detected(tmp_path):
     """With the cache named after these files; numba alone would keep the old code."""
     (tmp_path / "caller.py").write_text(CALLER)
     program = (
-        "import sys, pathlib, stages.kernels.compiled, flow.compile_cache as c\n"
+        "import sys, pathlib, stages.kernels.compiled, flow.compile_cache as c\nfrom numba.core import config\n"
         f"here = pathlib.Path({str(tmp_path)!r}); sys.path.insert(0, str(here))\n"
-        "c.config.CACHE_DIR = str(here / 'cache' / (c.cache_name([here]) if sys.argv[1] == 'ours' else 'one'))\n"
+        "config.CACHE_DIR = str(here / 'cache' / (c.cache_name([here]) if sys.argv[1] == 'ours' else 'one'))\n"
         "from caller import outer\n"
         "print(outer(1))\n"
     )

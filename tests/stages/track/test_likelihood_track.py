@@ -90,6 +90,7 @@ def run(things, messages, seconds=2.0, drives_mps=(0.0, 0.0, 0.0), jump=(math.in
         out += stage.on_pulses(pulses)
     for message in out:
         check_arrays(message)
+        assert not isinstance(message, TrackState) or message.reason, "every state has a reason"
     return out
 
 

@@ -97,6 +97,27 @@ def test_the_first_returns_are_searched_within_the_acquisition_radius():
     assert run(MeanShiftTrack(acquire_radius_m=1.0), messages)[0] == []  # the paper's
 
 
+def test_a_detection_is_refined_by_mean_shift_over_its_scan():
+    """The returns of the scan lie 0.8 m from the detected pixel; a return 0.9 m beyond them is within r of them only."""
+    hull = T0 + [0.8, 0, 0] + np.array([[0, 0.05, 0], [0, -0.05, 0]])
+    beyond = T0 + [1.7, 0, 0]
+    messages = [swept(hull, at(0)), detections(T0), swept([beyond], at(50))]
+    fixes, states = run(MeanShiftTrack(acquire_radius_m=1.0), messages)
+    np.testing.assert_allclose(fixes[0].xyz_vehicle_m, beyond, atol=1e-5)
+    assert states[0].reason == "started at a detection, moved 0.80 m by 2 returns of its scan; 1 returns"
+    assert run(MeanShiftTrack(acquire_radius_m=1.0, refine_detection=False), messages)[0] == []
+
+
+def test_only_the_returns_of_the_last_scan_refine_a_detection():
+    """Returns before the previous detections, or two sweeps ago, are of another scan."""
+    hull = T0 + [[0.8, 0, 0]]
+    for before in ([swept(hull, at(0)), detections()], [swept(hull, at(0)), empty(5400)]):
+        _, states = run(MeanShiftTrack(), [*before, detections(T0), swept([T0], at(5405))])
+        reasons = [state.reason for state in states]
+        assert any(reason.startswith("started at a detection;") for reason in reasons), reasons
+        assert not any("moved" in reason for reason in reasons)
+
+
 def test_a_slice_across_a_frame_boundary_is_split_by_time():
     points = [T0, T0 + [0.2, 0, 0], T0 + [0.4, 0, 0]]
     stamps = [at(119.9), at(120.0), at(120.1)]

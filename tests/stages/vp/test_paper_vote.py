@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stages.kernels.vp.paper_vote import cell_of, fullest, vote
+from stages.kernels.vp.paper_vote import cell_of, fullest, fullest_in_image, vote, vote_in_image
 from stages.vp.paper_vote import complete, most_orthogonal
 
 RNG = np.random.default_rng(4)
@@ -114,3 +114,31 @@ def test_the_sign_of_a_direction_does_not_matter_for_its_angle():
 def test_the_third_is_the_cross_product_of_length_one():
     three = complete(unit(1, 0, 0), unit(1, 1, 0))
     np.testing.assert_allclose(three, [[1, 0, 0], [math.sqrt(0.5), math.sqrt(0.5), 0], [0, 0, 1]], atol=1e-12)
+
+
+def test_two_segments_vote_for_the_pixel_where_their_lines_meet():
+    """v = 10 and v = u - 20 meet at (30, 10): lengths 20 and 10 sqrt 2, 45 deg apart; 10 px cells."""
+    segments = np.array([[0.0, 10, 20, 10], [60, 40, 70, 50]])
+    votes, sums = vote_in_image(segments, 100, 10)
+    w = 20 * 10 * math.sqrt(2)
+    assert votes[1, 3] == pytest.approx(w)
+    assert votes.sum() == pytest.approx(w)
+    np.testing.assert_allclose(sums[1, 3], [30 * w, 10 * w])
+    assert fullest_in_image(votes, sums) == pytest.approx((30, 10, 1))
+
+
+def test_lines_that_meet_outside_the_view_or_are_parallel_have_no_vote():
+    for other in ([60, 65, 70, 70], [0, 20, 20, 20], [60, 50, 60, 90]):  # at u = -50, parallel, at right angles
+        votes, sums = vote_in_image(np.array([[0.0, 10, 20, 10], other]), 100, 10)
+        assert votes.sum() == pytest.approx(0.0, abs=1e-9)
+        assert fullest_in_image(votes, sums)[2] < 1.0 or votes.sum() == 0.0
+
+
+def test_the_fullest_cell_of_the_image_is_where_most_lines_meet():
+    rng = np.random.default_rng(3)
+    towards = np.repeat([[71.2, 33.7], [20.0, 80.0]], [30, 12], axis=0) + rng.normal(0, 0.3, (42, 2))
+    start = rng.uniform(0, 100, (42, 2))
+    segments = np.hstack([start, start + 0.3 * (towards - start)])
+    u, v, share = fullest_in_image(*vote_in_image(segments, 100, 20))
+    assert math.hypot(u - 71.2, v - 33.7) < 1.0
+    assert 0.1 < share < 1.0

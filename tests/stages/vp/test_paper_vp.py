@@ -62,6 +62,31 @@ def test_the_axes_of_the_courtyard_are_found_in_mount_axes(rpy_deg, mount, camer
     assert len(set(np.argmax(np.abs(message.direction @ R.T), axis=1))) == 3, "three different axes"
 
 
+ON_AXIS = [{"azimuth_deg": 0, "off_axis_deg": 0}] + [{"azimuth_deg": a, "off_axis_deg": 70} for a in (-90, 0)]
+
+
+CORNER = (4.0, 3.0, -4.5)  # low in a corner of the courtyard: walls reach up to the axis of the lens
+
+
+@pytest.mark.parametrize("settings", [{"vote": "image", "views": ON_AXIS}, {"views": ON_AXIS}, {"vote": "image"}])
+def test_votes_and_layouts_of_the_views_find_the_axes_of_the_courtyard(settings):
+    R = rotation_from_rpy_deg((3, -2, -65))
+    message = vp(**settings).on_image(courtyard(R @ LOOKS_UP.matrix()[:3, :3], 77, "vehicle", CORNER))
+    check_arrays(message)
+    assert len(message.direction) == 3, message.reason
+    assert off_axes_deg(message, R).max() < 1.5
+
+
+def test_a_vote_in_the_image_needs_the_vanishing_points_in_the_views():
+    """Three views of 60 deg at 20 deg off the axis contain the vertical, and no horizontal direction."""
+    high = [{"azimuth_deg": a, "off_axis_deg": 20} for a in (-90, 30, 150)]
+    R = rotation_from_rpy_deg((3, -2, -65))
+    image = courtyard(R @ LOOKS_UP.matrix()[:3, :3], 77, "vehicle", CORNER)
+    message = vp(vote="image", views=high, fov_deg=60, min_lines=4).on_image(image)
+    assert len(message.direction) == 0
+    assert "no two vanishing points are at a right angle" in message.reason
+
+
 def test_the_vertical_comes_first_and_is_marked():
     message = directions(rotation_from_rpy_deg((3, 2, 40)))
     assert message.is_vertical.tolist() == [True, False, False]
@@ -143,6 +168,7 @@ def test_an_image_of_another_size_is_rejected_with_the_setting():
         ({"views": [{"azimuth_deg": 0, "off_axis_deg": 60}]}, "at least 2"),
         ({"fov_deg": 180.0}, "less than or equal to 120"),
         ({"camera_mount": "truck"}, "'vehicle' or 'drone'"),
+        ({"vote": "hough"}, "'sphere' or 'image'"),
         ({"min_lines": 1}, "greater than or equal to 2"),
         ({"polish": True}, "Extra inputs"),
     ],

@@ -11,6 +11,7 @@ ArduCopter/AP_Arming_Copter.cpp (mandatory_gps_checks: "waiting for home"); PX4 
 
 from __future__ import annotations
 
+import enum
 import math
 
 from links.simulated.autopilot.flight_stack.estimation.ekf3 import Ekf3
@@ -21,6 +22,14 @@ from links.simulated.autopilot.flight_stack.estimation.source_rules import (
 )
 
 
+class EkfAction(enum.Enum):
+    """What a failed check requires."""
+
+    YAW_RESET = enum.auto()
+    LANE_SWITCH = enum.auto()
+    FAILSAFE = enum.auto()
+
+
 class EkfCheck:
     """Copter::ekf_check. Call `update` at 10 Hz while armed."""
 
@@ -28,8 +37,8 @@ class EkfCheck:
         self.fails = 0
         self.failed = False
 
-    def update(self, ekf: Ekf3) -> str | None:
-        """One check: None, "yaw reset", "lane switch" or "failsafe", when that is to be done."""
+    def update(self, ekf: Ekf3) -> EkfAction | None:
+        """One check; what is to be done now, None: nothing."""
         if not ekf.origin:
             return None
         if over_threshold(ekf) or not ekf.has_position:
@@ -37,12 +46,12 @@ class EkfCheck:
                 return None
             self.fails += 1
             if self.fails == EKF_CHECK_ITERATIONS - 2 and over_threshold(ekf):
-                return "yaw reset"
+                return EkfAction.YAW_RESET
             if self.fails == EKF_CHECK_ITERATIONS - 1:
-                return "lane switch"
+                return EkfAction.LANE_SWITCH
             if self.fails >= EKF_CHECK_ITERATIONS:
                 self.failed = True
-                return "failsafe"
+                return EkfAction.FAILSAFE
         elif self.fails > 0:
             self.fails -= 1
             if self.fails == 0:

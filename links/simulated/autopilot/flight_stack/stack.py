@@ -24,7 +24,7 @@ from links.simulated.autopilot.flight_stack.commands import handle_frame, send_o
 from links.simulated.autopilot.flight_stack.downlink import Downlink
 from links.simulated.autopilot.flight_stack.estimation.estimator import Estimators
 from links.simulated.autopilot.flight_stack.estimation.source_rules import EKF_CHECK_HZ, SOURCE_SETS, AidingSource
-from links.simulated.autopilot.flight_stack.failsafe import EkfCheck, arming_refusal
+from links.simulated.autopilot.flight_stack.failsafe import EkfAction, EkfCheck, arming_refusal
 from links.simulated.autopilot.flight_stack.guidance import (
     LAND_FAST_ABOVE_M,
     LAND_FAST_MPS,
@@ -35,9 +35,10 @@ from links.simulated.autopilot.flight_stack.guidance import (
     SurveyFrame,
     rotate,
 )
+from links.simulated.autopilot.flight_stack.outcomes.events import EventKind, FlightEvent
 from links.simulated.autopilot.flight_stack.quadrotor import TICK_S, Quadrotor
 from links.simulated.autopilot.flight_stack.sensors import Sensors
-from links.simulated.autopilot.flight_stack.settings import TakeOff, UseSources
+from links.simulated.autopilot.flight_stack.settings import Hold, TakeOff, UseSources
 from links.simulated.autopilot.radio import Radio
 from links.simulated.kernels.airframe import QUATERNION, THRUST
 from links.simulated.kernels.motion import GRAVITY_MPS2
@@ -79,7 +80,7 @@ class FlightStack:
         self._downlink = Downlink(settings, start_ns, seed)
         self.streams = self._downlink.streams
         self.origin: tuple[int, int, int] | None = None
-        self.events: list[tuple[float, str]] = []  # time and what happened, for the outcome
+        self.events: list[FlightEvent] = []  # for the outcome
         position, _, _, yaw = (part[0] for part in path.at(np.zeros(1)))
         home = np.array([position[0], position[1], ground_m + 0.2]) if s.on_ground else position
         self._home, self._world_yaw = home, -math.radians(settings.heading_of_world_x_deg)
@@ -143,7 +144,7 @@ class FlightStack:
             return False
         self._switched_s = self._tick * TICK_S
         self.text(6, f"Using EKF Source Set {number}")
-        self._note(f"source set {number}")
+        self._note(EventKind.SOURCE_SET, number=number)
         return True
 
     def set_origin(self, origin: tuple[int, int, int]) -> bool:
@@ -212,7 +213,7 @@ class FlightStack:
         if self.mode == LAND:
             if self.quadrotor.grounded:
                 self.armed = False
-                self._note("landed")
+                self._note(EventKind.LANDED)
             above_m = estimate[2] - self._frame().xyz_m[2] - self.quadrotor.ground_m
             climb = -LAND_FAST_MPS if above_m > LAND_FAST_ABOVE_M else -LAND_MPS
             yaw = math.atan2(2 * estimate[8] * estimate[9], 1 - 2 * estimate[8] ** 2)
@@ -258,7 +259,7 @@ class FlightStack:
             if isinstance(step, UseSources):
                 self.use_sources(step.set)
                 continue
-            self._note(f"plan: {step.do}")
+            self._note(EventKind.PLAN, step.do, holds=isinstance(step, Hold))
             self._guidance.begin(step, time_s)
             self._climbing_to = None
             if isinstance(step, TakeOff):
@@ -281,25 +282,25 @@ class FlightStack:
                 self._guidance.target.xyz_m = self.ekf.output()[0:3].copy()
                 self._guidance.target.yaw_rad = self.ekf.primary.lane.yaw_rad
                 self._controller.reset()
-                self._note("armed")
+                self._note(EventKind.ARMED)
             elif refusal is not None:
                 self.text(2, refusal)
                 if refusal not in self._texts:
                     self._texts.add(refusal)
-                    self._note(refusal)
+                    self._note(EventKind.NOT_ARMED, refusal)
 
     def _ekf_check(self) -> None:
         action = self.ekf.failsafe_action(self._check)
-        if action == "yaw reset":
+        if action is EkfAction.YAW_RESET:
             self.ekf.primary.request_yaw_reset()
-        elif action == "lane switch":
+        elif action is EkfAction.LANE_SWITCH:
             lane = self.ekf.switch_lane()
             if lane is not None:
                 self.text(4, f"EKF primary changed:{lane}")
-                self._note(f"lane {lane}")
-        elif action == "failsafe":
+                self._note(EventKind.LANE, number=lane)
+        elif action is EkfAction.FAILSAFE:
             self.text(2, "EKF Failsafe: changed to LAND Mode" if not self.px4 else "Failsafe: no local position")
-            self._note("EKF failsafe")
+            self._note(EventKind.EKF_FAILSAFE)
             self.mode = LAND
 
     def _do_faults(self, time_s: float, now_ns: int) -> None:
@@ -308,11 +309,11 @@ class FlightStack:
             self._restart(now_ns)
         while self._jumps and time_s >= self._jumps[0][0]:
             self.ekf.jump(rotate(np.array(self._jumps.popleft()[1]), self._frame().yaw_rad))
-            self._note("EKF reset")
+            self._note(EventKind.EKF_RESET)
 
     def _restart(self, now_ns: int) -> None:
         """Boot again; in flight the motors keep the airframe level at hover thrust meanwhile."""
-        self._note("reboot")
+        self._note(EventKind.REBOOT)
         self._boot_ns, self._silent_until_ns = now_ns, now_ns + round(BOOT_S * NS)
         self._downlink.restart()
         self.origin = None
@@ -345,5 +346,5 @@ class FlightStack:
         self._sensors.magnetometer.sample(self._tick * TICK_S, R, float(self.quadrotor.state[THRUST]) / GRAVITY_MPS2)
         return self._sensors.magnetometer.heading_rad(R)
 
-    def _note(self, what: str) -> None:
-        self.events.append((self._tick * TICK_S, what))
+    def _note(self, kind: EventKind, detail: str = "", number: int = 0, holds: bool = False) -> None:
+        self.events.append(FlightEvent(self._tick * TICK_S, kind, detail, number, holds))

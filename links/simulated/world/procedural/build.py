@@ -15,6 +15,7 @@ from numpy.random import Generator
 from links.simulated.world.mesh import Mesh, merge
 from links.simulated.world.movers import Car, Mover, draw_balloon, draw_bird
 from links.simulated.world.procedural.atlanta import atlanta
+from links.simulated.world.procedural.clutter import clutter, people
 from links.simulated.world.procedural.open_scenes import campus, open_lot, park_edge
 from links.simulated.world.procedural.parts import car
 from links.simulated.world.procedural.settings import HALF_LENGTH_M, Kind, SceneSettings, VehicleCorridor
@@ -49,8 +50,15 @@ def build_world(settings: SceneSettings, camera_height_m: float, seed: int, vehi
     start = np.array([0.0, settings.vehicle_lane_y_m])
     corridor = VehicleCorridor(vehicle_xy_m @ rotation_z(yaw)[:2, :2].T + start)
     parts = KINDS[settings.kind](settings, corridor, np.random.default_rng([seed, 1]))
+    walkers: list[Mover] = []
+    if settings.clutter:
+        parts += clutter(settings, corridor, np.random.default_rng([seed, 30]))
+        R = rotation_z(-yaw)
+        shift = R @ np.array([0.0, -settings.vehicle_lane_y_m, -camera_height_m])
+        walkers += people(settings, corridor, (R, shift), np.random.default_rng([seed, 31]))
     mesh = merge(parts).moved((0.0, -settings.vehicle_lane_y_m, -camera_height_m)).moved(rotation=rotation_z(-yaw))
-    return World(mesh, _movers(settings, camera_height_m, corridor, np.random.default_rng([seed, 10])))
+    movers = _movers(settings, camera_height_m, corridor, np.random.default_rng([seed, 10]))
+    return World(mesh, (*movers, *walkers))
 
 
 def world_mesh(settings: SceneSettings, camera_height_m: float, seed: int) -> Mesh:

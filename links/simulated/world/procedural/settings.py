@@ -31,6 +31,10 @@ MOVERS: dict[str, tuple[int, int, int]] = {  # kind: moving cars, birds, balloon
 }
 
 
+def _is_false(value: object) -> bool:
+    return value is False
+
+
 def _is_usual(sky: str) -> bool:
     return sky == "usual"  # scenario files leave out a setting that they do not use
 
@@ -53,6 +57,8 @@ class SceneSettings(BaseModel):
     balloons: int | None = Field(default=None, ge=0, le=10)
     # varied: gliding, circling and hovering birds, flocks, insects, kites and bags in place of `birds` and `balloons`
     sky: Annotated[Literal["usual", "varied"], Field(exclude_if=_is_usual)] = "usual"
+    # furniture, planters, signs and boards at odd angles, oblique wires, people; windows reflect the scene
+    clutter: Annotated[bool, Field(exclude_if=_is_false)] = False
     vehicle_lane_y_m: float = -1.9  # the vehicle's start position across the street
     vehicle_yaw_deg: float = 0.0
 

@@ -118,7 +118,7 @@ def test_a_jump_of_its_clock_that_is_no_boot_does_not_make_it_independent():
     assert answers[4:] == [False] * 4
 
 
-def test_poses_sent_to_a_silent_autopilot_count_once_it_is_heard():
+def test_poses_sent_to_a_silent_autopilot_count_once_it_sends():
     independence = Independence()
     for i in range(100_000):
         independence.on_sent("ODOMETRY", i)

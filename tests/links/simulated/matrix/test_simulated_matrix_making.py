@@ -20,8 +20,8 @@ from links.simulated.matrix.making import Task, TaskResult, TaskStatus, is_made,
 from links.simulated.matrix.matrix import Conditions, cells, scenario_of
 from links.simulated.rig.closed_loop import ClosedLoop, loop_metadata
 from links.simulated.rig.run import simulate_into
-from tests.links.simulated.fast_loop import GRAPH
 
+GRAPH = (Path(__file__).parents[1] / "fast_loop.yaml").read_text(encoding="utf-8")
 VIEWER = "  view: {use: links.viewer.Viewer}\n"
 STAMPS = "  stamps: {use: tests.flow.toys.Stamps}\n"
 HOVER = Cell("open_lot", 10, "hover", "parked")

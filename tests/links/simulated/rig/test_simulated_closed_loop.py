@@ -24,11 +24,11 @@ from links.simulated.rig.run import Simulation, simulate
 from links.simulated.rig.scenario import Scenario, load_scenario
 from links.simulated.world.path import Path, Waypoint
 from stages.messages import ServoGoal
-from tests.links.simulated.fast_loop import GRAPH
 
 ROOT = FilePath(__file__).parents[4]
 SIM = ROOT / "configs/sim.yaml"
 STREET = ROOT / "configs/scenarios/street_sweep.yaml"
+GRAPH = (ROOT / "tests/links/simulated/fast_loop.yaml").read_text(encoding="utf-8")
 
 
 @pytest.fixture(scope="module")

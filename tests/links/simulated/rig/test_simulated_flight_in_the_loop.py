@@ -151,7 +151,7 @@ def test_a_gap_of_the_lidar_stops_the_fixes() -> None:
     assert not any("xyz_m" in fix for fix in fixes)
 
 
-def test_after_a_kill_grd_starts_anew_and_the_flight_goes_on() -> None:
+def test_after_a_kill_grd_starts_again_and_the_flight_goes_on() -> None:
     scenario = changed(load_scenario(FLIGHT), 17.0, {"plan": [{"do": "path", "for_s": 20}]})
     scenario = scenario.changed(closed_loop={"killed_s": (13.0, 14.0)})
     positions = Positions()

@@ -143,3 +143,44 @@ def test_the_corridor_is_as_wide_and_as_long_as_the_vehicle() -> None:
 def test_rotating_the_vehicle_rotates_the_scene_in_the_opposite_direction() -> None:
     ahead = _wall_families(_world("manhattan", vehicle_yaw_deg=20.0).mesh)
     assert ahead[round(70 / BIN_DEG)] > 0.99 * ahead.sum()  # -20 deg, modulo 90
+
+
+@pytest.mark.parametrize("kind", ["manhattan", "campus"])
+def test_clutter_adds_objects_and_people_and_leaves_the_rest_as_it_is(kind: str) -> None:
+    plain, cluttered, again = _world(kind), _world(kind, clutter=True), _world(kind, clutter=True)
+    np.testing.assert_array_equal(cluttered.mesh.vertices_m, again.mesh.vertices_m)
+    faces = len(plain.mesh.faces)
+    np.testing.assert_array_equal(cluttered.mesh.faces[:faces], plain.mesh.faces)
+    np.testing.assert_array_equal(cluttered.mesh.vertices_m[: len(plain.mesh.vertices_m)], plain.mesh.vertices_m)
+    assert cluttered.mesh.is_surface("print")[faces:].any()
+    assert not plain.mesh.is_surface("print").any()
+    names = [mover.name for mover in cluttered.movers]
+    assert names[: len(plain.movers)] == [mover.name for mover in plain.movers]
+    assert set(names[len(plain.movers) :]) == {"person"}
+    assert len(names) - len(plain.movers) > 8
+
+
+def test_clutter_keeps_the_corridor_of_the_vehicle_and_the_sky_free() -> None:
+    path = np.column_stack([np.linspace(0, 40, 81), np.linspace(0, 8.0, 81)])  # onto the pavement
+    with_path = build_world(SceneSettings(kind="manhattan", clutter=True), HEIGHT_M, 3, path)
+    plain = build_world(SceneSettings(kind="manhattan"), HEIGHT_M, 3, path)
+    added = with_path.mesh.vertices_m[len(plain.mesh.vertices_m) :]
+    assert (added[:, 2] + HEIGHT_M).max() < 9.0
+    low = added[added[:, 2] + HEIGHT_M < 2.0]
+    assert np.linalg.norm(low[:, None, :2] - path, axis=2).min() > 0.9
+
+
+def test_people_walk_on_the_ground_at_walking_speed_and_turn_back() -> None:
+    times = np.arange(0.0, 120.0, 0.1)
+    walkers = [mover for mover in _world("manhattan", clutter=True).movers if mover.name == "person"]
+    for walker in walkers:
+        R, t = walker.poses(times)
+        speed = np.linalg.norm(np.diff(t, axis=0), axis=1) / 0.1
+        assert np.median(speed) == pytest.approx(walker.speed_mps, rel=1e-6)
+        assert 1.2 <= walker.speed_mps <= 1.5
+        assert np.ptp(t[:, :2], axis=0).max() < 31.0
+        ahead = np.einsum("ni,ni->n", R[:-1, :, 0], np.diff(t, axis=0)) / 0.1
+        assert np.median(ahead) == pytest.approx(walker.speed_mps, rel=1e-6)
+        feet = min(mesh.vertices_m[:, 2].min() for mesh in walker.meshes)
+        assert 0.0 <= t[0, 2] + HEIGHT_M + feet < 0.3
+        assert set(walker.shape(times)) == set(range(len(walker.meshes)))

@@ -16,13 +16,13 @@ def _path(*points: tuple[float, float, float, float], yaw_deg: float = 0.0) -> P
 
 def test_the_spline_passes_its_knots_and_its_derivatives_are_consistent() -> None:
     knot_s, knots = np.array([0.0, 1.0, 2.5, 4.0]), np.array([[0.0, 1], [2, 0], [1, 5], [3, 3]])
-    np.testing.assert_allclose(natural_spline(knot_s, knots, knot_s)[0], knots, atol=1e-12)
+    np.testing.assert_allclose(natural_spline(knot_s, knots)(knot_s)[0], knots, atol=1e-12)
     t, d = np.array([0.3, 1.7, 3.2]), 1e-5
-    _, slope, curve = natural_spline(knot_s, knots, t)
-    before, after = natural_spline(knot_s, knots, t - d), natural_spline(knot_s, knots, t + d)
+    _, slope, curve = natural_spline(knot_s, knots)(t)
+    before, after = natural_spline(knot_s, knots)(t - d), natural_spline(knot_s, knots)(t + d)
     np.testing.assert_allclose(slope, (after[0] - before[0]) / (2 * d), atol=1e-6)
     np.testing.assert_allclose(curve, (after[1] - before[1]) / (2 * d), atol=1e-6)
-    np.testing.assert_allclose(natural_spline(knot_s, knots, np.array([0.0, 4.0]))[2], 0.0, atol=1e-12)
+    np.testing.assert_allclose(natural_spline(knot_s, knots)(np.array([0.0, 4.0]))[2], 0.0, atol=1e-12)
 
 
 def test_a_straight_path_is_flown_at_constant_speed() -> None:

@@ -15,7 +15,7 @@ from links.simulated.autopilot.flight_stack.estimation.ekf2 import Ekf2
 from links.simulated.autopilot.flight_stack.estimation.ekf3 import Ekf3
 from links.simulated.autopilot.flight_stack.estimation.external_input import ArduPilotInput, Px4Input
 from links.simulated.autopilot.flight_stack.estimation.source_rules import SOURCE_SETS, AidingSource, Sources
-from links.simulated.autopilot.flight_stack.failsafe import EkfCheck
+from links.simulated.autopilot.flight_stack.failsafe import EkfAction, EkfCheck
 from links.simulated.autopilot.flight_stack.quadrotor import TICK_S
 from links.simulated.autopilot.flight_stack.sensors import GpsFix
 from links.simulated.autopilot.flight_stack.settings import FlightStackSettings
@@ -151,7 +151,7 @@ class Estimators:
             core.texts.clear()
         return found
 
-    def failsafe_action(self, check: EkfCheck) -> str | None:
+    def failsafe_action(self, check: EkfCheck) -> EkfAction | None:
         """What the check of the filter asks for now."""
         return check.update(self.primary)
 

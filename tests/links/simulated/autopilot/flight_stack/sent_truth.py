@@ -93,7 +93,7 @@ class Host:
 
     def events(self) -> list[str]:
         """What happened."""
-        return [what for _, what in self.stack.events]
+        return [str(event) for event in self.stack.events]
 
     def scatter_m(self, from_s: float) -> float:
         """3D RMS of the position about its mean since a time."""

@@ -36,7 +36,7 @@ def fly(drone: Quadrotor, duration_s: float, command: np.ndarray = LEVEL) -> np.
     return np.vstack(samples)
 
 
-def test_in_still_air_it_hangs_and_feels_one_g() -> None:
+def test_in_still_air_it_hovers_and_measures_one_g() -> None:
     drone = quadrotor()
     samples = fly(drone, 3.0)
     np.testing.assert_allclose(drone.state[0:3], [0, 0, 10], atol=1e-9)

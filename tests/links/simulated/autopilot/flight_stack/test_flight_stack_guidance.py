@@ -12,13 +12,13 @@ from links.simulated.world.path import Path, Waypoint
 VEHICLE = Path(
     waypoints=(Waypoint(t_s=0, xyz_m=(0, 0, 0)), Waypoint(t_s=5, xyz_m=(0, 0, 0)), Waypoint(t_s=45, xyz_m=(200, 0, 0)))
 )
-BESIDE_M = np.array([4.0, 1.0, 10.0])
+START_M = np.array([4.0, 1.0, 10.0])
 FRAME = SurveyFrame(np.pi / 2, np.zeros(3), np.pi / 2)  # the world's x axis is the frame's y axis
 
 
 def followed(drift_m_per_s: float, until_s: float) -> FlightTarget:
     drift = lambda time_s: np.array([drift_m_per_s * max(time_s - 10.0, 0.0), 0.0, 0.0])  # noqa: E731
-    guidance = Guidance(VEHICLE, VEHICLE, FlightTarget(BESIDE_M.copy()), drift)
+    guidance = Guidance(VEHICLE, VEHICLE, FlightTarget(START_M.copy()), drift)
     guidance.begin(Follow(for_s=60.0), 5.0)
     return guidance.update(until_s, FRAME)
 
@@ -27,7 +27,7 @@ def test_follow_keeps_its_offset_from_the_vehicle_and_has_its_velocity() -> None
     target = followed(0.0, 25.0)
     moved_m = VEHICLE.at(np.array([25.0]))[0][0, 0]
     assert moved_m > 60.0
-    assert target.xyz_m == pytest.approx(BESIDE_M + np.array([0.0, moved_m, 0.0]))
+    assert target.xyz_m == pytest.approx(START_M + np.array([0.0, moved_m, 0.0]))
     assert target.velocity_mps == pytest.approx([0.0, VEHICLE.at(np.array([25.0]))[1][0, 0], 0.0], abs=1e-9)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from flow.link import Record
-from links.simulated.autopilot.flight_stack.outcome import FlightOutcome
+from links.simulated.autopilot.flight_stack.outcomes.outcome import FlightOutcome
 from links.simulated.sensors.vehicle_odometry import VehicleOdometry, VehicleOdometrySettings
 from links.simulated.world.mesh import RayScene, box
 from links.simulated.world.scene import Truth

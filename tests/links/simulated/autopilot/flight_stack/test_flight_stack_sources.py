@@ -51,7 +51,7 @@ def test_px4_takes_positions_without_rotation_only_with_a_compass(sets: list[str
 
 
 def test_a_wrong_position_moves_the_drone_the_other_way() -> None:
-    """The drone holds where it is told it is: told 1 m too far forward from 8 s on, it goes back by 1 m."""
+    """A position that is 1 m too far forward from 8 s on moves the drone back by 1 m."""
     host = Host(20.0)
 
     def shift(message, time_s: float) -> None:
@@ -92,7 +92,7 @@ def test_without_poses_it_lands_after_the_timeout_and_one_second(kind: str, afte
     host = Host(22.0, kind=kind)
     host.sends = lambda time_s: 1.0 < time_s < 8.0
     host.run(22.0)
-    failsafe_s = next(time_s for time_s, what in host.stack.events if what == "EKF failsafe")
+    failsafe_s = next(event.time_s for event in host.stack.events if str(event) == "EKF failsafe")
     assert failsafe_s == pytest.approx(8.0 + after_s, abs=0.5)
     assert host.stack.quadrotor.state[2] < 6.0
     assert host.received("HEARTBEAT")[-1].custom_mode == 9

@@ -1,0 +1,1 @@
+"""What became of a flight, for statistics: events, sent poses and their errors, the outcome."""

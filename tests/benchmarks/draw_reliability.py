@@ -1,0 +1,167 @@
+"""Draw docs/images/reliability.png: stated against actual errors of vanishing directions, simulated beside real.
+
+    python -m tests.benchmarks.draw_reliability [IMAGES_PER_CAMERA]
+
+Needs the extras `evaluate` and `simulate`. The real half needs ../shared/data (panoramas, York Urban, corridor) and is
+empty without it. Prints one line per group; writes pictures of simulated failures to docs/images/vp_failure_*.jpg.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from pathlib import Path
+
+import cv2
+import matplotlib
+import numpy as np
+from matplotlib import pyplot as plt
+
+from stages.geometry.frames import Pose
+from stages.geometry.lens_files import lens_from_ocamcalib
+from stages.messages import CameraMount, Image
+from stages.vp import GreatCircleVp
+from tests.benchmarks.bench_vp import R_MOUNT_CAMERA, YORK, york_camera, york_truth
+from tests.stages import panoramas
+from tests.stages.panoramas import Answer
+from tests.stages.reliability import DATA, answer, grd_stage
+from tests.stages.simulated_views import SCENES, View, views
+
+IMAGES = Path(__file__).resolve().parents[2] / "docs" / "images"
+FORWARD = Pose(quaternion_xyzw=(-0.5, 0.5, -0.5, 0.5))
+SEED = 201  # of worlds that no threshold was chosen with
+MOST_PICTURES = 3
+Groups = dict[str, list[Answer]]
+
+
+def main() -> None:
+    """Compute both halves, print the table, draw the figure."""
+    count = int(sys.argv[1]) if len(sys.argv) > 1 else 5
+    matplotlib.use("Agg")
+    print(corridor())  # noqa: T201
+    real = real_groups(4 * count)
+    simulated = simulated_groups(count)
+    figure, both = plt.subplots(1, 2, figsize=(9.5, 4.0), sharey=True, layout="constrained")
+    for axes, title, groups in zip(both, ("simulated", "real"), (simulated, real), strict=True):
+        draw(axes, title, groups)
+    both[0].set_ylabel("share of directions with a smaller error")
+    figure.savefig(IMAGES / "reliability.png", dpi=75)
+
+
+def draw(axes: plt.Axes, title: str, groups: Groups) -> None:
+    """One curve per group: share of directions whose error is below k stated sigmas."""
+    k = np.linspace(0, 6, 121)
+    axes.plot(k, 1 - np.exp(-(k**2) / 2), color="0.6", ls="--", label="Gaussian, two axes")
+    for name, found in groups.items():
+        error, sigma = (np.concatenate([getattr(a, part) for a in found]) for part in ("error_deg", "sigma_deg"))
+        axes.plot(k, [(error < at * sigma).mean() for at in k], label=f"{name} ({len(found)} images)")
+        share = ", ".join(f"{100 * np.mean(error < at * sigma):.1f}" for at in (1, 2, 3))
+        frames, wrong = 100 * np.mean([a.has_frame for a in found]), sum(a.wrong for a in found)
+        errors = f"{np.median(error):.2f}, {np.quantile(error, 0.95):.2f} | {np.median(sigma):.2f}"
+        print(f"| {title}, {name} | {len(found)} | {frames:.0f} | {errors} | {share} | {wrong} |")  # noqa: T201
+    axes.set(title=title, xlabel="error / stated sigma", ylim=(0, 1.02), xlim=(0, 6))
+    axes.legend(loc="lower right", fontsize=7)
+
+
+def simulated_groups(count: int) -> Groups:
+    """Five scenes without and with clutter; pictures of the failures with clutter."""
+    groups: Groups = {}
+    pictures = 0
+    for clutter in (False, True):
+        name = "with clutter" if clutter else "without clutter"
+        for scene in SCENES:
+            stages: dict[CameraMount, GreatCircleVp] = {}
+            for view in views(scene, SEED, count, clutter):
+                vp = stages.setdefault(view.camera_mount, grd_stage(view))
+                if view.tilt is not None:
+                    vp.on_tilt(view.tilt)
+                found = vp.on_image(view.image)
+                result = answer(found, view.R_world_mount, view.truth)
+                groups.setdefault(name, []).append(result)
+                if clutter and pictures < MOST_PICTURES and (not result.has_frame or not result.within):
+                    pictures += 1
+                    save_failure(IMAGES / f"vp_failure_{pictures}.jpg", scene, view, found.line_end, result)
+    return groups
+
+
+def save_failure(file: Path, scene: str, view: View, ends: np.ndarray, result: Answer) -> None:
+    """The image with its lines, and below it the reason and the errors."""
+    picture = np.ascontiguousarray(view.colour[..., ::-1])
+    camera = view.scenario.cameras.vehicle if view.camera_mount is CameraMount.VEHICLE else view.scenario.cameras.drone
+    assert camera is not None
+    for arc in ends @ grd_stage(view).settings.T_mount_camera.matrix()[:3, :3]:
+        share = np.linspace(0, 1, 9)[:, None]
+        path = (1 - share) * arc[0] + share * arc[1]
+        at = camera.true_lens.project(path / np.linalg.norm(path, axis=1, keepdims=True))
+        if np.isfinite(at).all():
+            cv2.polylines(picture, [np.rint(at).astype(np.int32)], False, (0, 255, 255), 1, cv2.LINE_AA)
+    pairs = zip(result.error_deg, result.sigma_deg, strict=True)
+    errors = ", ".join(f"{error:.1f} ({sigma:.2f})" for error, sigma in pairs)
+    text = (f"{scene}, {view.camera_mount.value}: {result.reason}", f"error (stated sigma) [deg]: {errors or '-'}")
+    bar = np.full((50, picture.shape[1], 3), 255, np.uint8)
+    for row, line in enumerate(text):
+        cv2.putText(bar, line[:110], (6, 20 + 22 * row), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (0, 0, 0), 1, cv2.LINE_AA)
+    cv2.imwrite(str(file), np.vstack([picture, bar]), [cv2.IMWRITE_JPEG_QUALITY, 70])
+    print(f"{file.name}: {' | '.join(text)}")  # noqa: T201
+
+
+def real_groups(count: int) -> Groups:
+    """Renders of panoramas, `count` of each and camera, and York's training half; empty without the data."""
+    groups: Groups = {}
+    if panoramas.FOLDER.exists():
+        for name in panoramas.LABELS:
+            group = "panorama kept back" if name == panoramas.KEPT_BACK else "three panoramas"
+            for mount in CameraMount:
+                groups.setdefault(group, []).extend(panoramas.answers(name, mount, count, SEED))
+    if YORK.exists():
+        groups["York, training half"] = york()
+    return groups
+
+
+def york() -> list[Answer]:
+    """Three directions of each image, without gravity; labels good to about 1 deg."""
+    focal, column, row = york_camera()
+    lens = {"model": "ocam", "polynomial": (-focal, 0.0, 0.0, 0.0, 0.0), "centre_px": (column, row)}
+    vp = forward_stage(lens | {"max_off_axis_deg": 60.0})
+    found: list[Answer] = []
+    for folder in sorted(YORK.glob("P*")):
+        grey = cv2.imread(str(folder / f"{folder.name}.jpg"), cv2.IMREAD_GRAYSCALE)
+        seen = vp.on_image(Image(stamp_ns=0, frame_id="camera_drone", grey=grey))
+        cosine = np.abs(seen.direction @ R_MOUNT_CAMERA @ york_truth(folder).T)
+        error = np.degrees(np.arccos(np.clip(cosine.max(axis=1, initial=0.0), 0.0, 1.0)))
+        found.append(Answer(error, np.degrees(seen.sigma_rad), bool((seen.frame >= 0).any()), seen.reason))
+    return found
+
+
+def forward_stage(lens: object) -> GreatCircleVp:
+    """grd's stage for a camera that faces forward, without gravity, one Manhattan frame."""
+    return GreatCircleVp(
+        camera_mount=CameraMount.DRONE,
+        T_mount_camera=FORWARD,
+        lens=lens,
+        search_deg=45.0,
+        vertical_sigma_deg=20.0,
+        max_frames=1,
+    )
+
+
+def corridor() -> str:
+    """Angles between the directions in the real corridor, each by its own lines alone; the building's are right."""
+    folder = DATA / "fisheye"
+    if not folder.exists():
+        return "corridor: not here"
+    lens = lens_from_ocamcalib((folder / "corridor_1600_ocamcalib.txt").read_text()).lens
+    grey = cv2.imread(str(folder / "corridor_1600.jpg"), cv2.IMREAD_GRAYSCALE)
+    found = forward_stage(lens).on_image(Image(stamp_ns=0, frame_id="camera_drone", grey=grey))
+    d = np.empty((len(found.direction), 3))
+    for k in range(len(d)):
+        weighted = (found.line_normal / found.line_sigma_rad[:, None])[found.line_direction == k]
+        d[k] = np.linalg.svd(weighted)[2][-1]
+    off = [90.0 - math.degrees(math.acos(abs(float(d[i] @ d[j])))) for i in range(len(d)) for j in range(i)]
+    sigma = ", ".join(f"{s:.2f}" for s in np.degrees(found.sigma_rad))
+    angles = ", ".join(f"{angle:.2f}" for angle in off)
+    return f"corridor: {len(d)} directions, each by its lines off square by {angles} deg; sigma {sigma} deg"
+
+
+if __name__ == "__main__":
+    main()

@@ -22,7 +22,14 @@ from links.evaluation.comparison import (
     uneven_warnings,
 )
 from links.evaluation.evaluation import Evaluation
-from links.evaluation.groups import Key, false_track_table, group_table, reliability_table, rotation_table
+from links.evaluation.groups import (
+    Key,
+    false_track_table,
+    group_table,
+    probability_score_table,
+    reliability_table,
+    rotation_table,
+)
 from links.evaluation.metrics import evaluate
 from links.evaluation.report import as_json, write_report
 from links.evaluation.run_data import per_drone, read_run
@@ -108,6 +115,8 @@ def _summaries(own: list[Evaluation], keys: list[Key]) -> list[Table]:
     if empty and (wanted or len(empty) > 1):
         tables.append(false_track_table(empty))
     if (wanted or len(primary) > 1) and (table := reliability_table(primary)):
+        tables.append(table)
+    if (wanted or len(primary) > 1) and (table := probability_score_table(primary)):
         tables.append(table)
     return tables
 

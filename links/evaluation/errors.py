@@ -2,7 +2,7 @@
 
 Source: grd; Euler angles as in the paper's tables: R = Rz(yaw) Ry(pitch) Rx(roll), differences wrapped to +-180 deg;
 Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 5.4 (NEES); Wilson, J. Am. Stat.
-Assoc. 22 (1927) (interval of a share).
+Assoc. 22 (1927) (interval of a share); Brier, Monthly Weather Review 78 (1950).
 """
 
 from __future__ import annotations
@@ -234,6 +234,12 @@ def wilson_interval(successes: float, trials: float) -> tuple[float, float]:
 def poisson_upper(events: int) -> float:
     """One-sided 95 % upper bound of a Poisson mean after so many events: chi2_{2 events + 2}(95 %) / 2."""
     return float(stats.chi2.ppf(0.95, 2 * events + 2)) / 2
+
+
+def brier_and_log_loss(probability: Array64, outcome: Flags) -> tuple[float, float]:
+    """Mean Brier score and log loss [nats] of probabilities (n,); a certain and wrong one counts 13.8 nats."""
+    p = np.clip(probability, 1e-6, 1 - 1e-6)
+    return float(np.mean((p - outcome) ** 2)), float(-np.log(np.where(outcome, p, 1 - p)).mean())
 
 
 def effective_samples(series: Array64) -> float:

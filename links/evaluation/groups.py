@@ -17,10 +17,15 @@ import numpy as np
 import pandas as pd
 
 from flow.link import LinkError
-from links.evaluation.errors import inside_95, p95, poisson_upper, rms, wilson_interval
+from links.evaluation.errors import brier_and_log_loss, inside_95, p95, poisson_upper, rms, wilson_interval
 from links.evaluation.evaluation import Evaluation
 from links.evaluation.metrics import CAMERAS
-from links.evaluation.stage_metrics import PROBABILITY_EDGES, probability_outcomes
+from links.evaluation.stage_metrics import (
+    PROBABILITY_EDGES,
+    SCORE_RANGES_M,
+    candidate_outcomes,
+    probability_outcomes,
+)
 from links.evaluation.tables import OBJECT, Table, by_config, number_text, runs_table
 
 CONFIG, ALL = "config", "all"
@@ -62,6 +67,14 @@ def _per_h(key: str) -> Statistic:
     return statistic
 
 
+def _false_track_bound(runs: pd.DataFrame) -> float:
+    """One-sided 95 % bound of the rate of false tracks [/h], a Poisson process over all runs."""
+    counted = runs.loc[runs.false_tracks.notna() & runs.span_s.notna()]
+    if not len(counted):
+        return math.nan
+    return poisson_upper(int(counted.false_tracks.sum())) / (counted.span_s.sum() / 3600)
+
+
 def _reacquisition(statistic: Callable[[pd.Series], float]) -> Statistic:
     """A statistic of the times to reacquire of all occlusions."""
 
@@ -97,6 +110,8 @@ FIRST_ACCURATE = "first accurate\nmedian [s]", "first accurate\n95 % [s]"  # a f
 COLUMNS: Columns = {
     "runs": (0, len),
     "track\naccuracy [%]": (1, _mean("track_accuracy")),
+    "precision\n[%]": (1, _percent("precision", "count", "of")),
+    "GOSPA\n[m]": (3, _mean("gospa_m")),
     "ever\naccurate": (0, lambda runs: (runs.track_accuracy > 0).sum()),
     "no\noutput": (0, lambda runs: (runs.outputs == 0).sum()),
     "mostly\nfalse": (0, lambda runs: (runs.false_outputs > 0.5 * runs.outputs).sum()),
@@ -117,20 +132,24 @@ COLUMNS: Columns = {
     "in 95 %\n[%]": (1, _percent("inside_95_share", "count", "of")),
     "false\n[/h]": (0, _per_h("false_outputs")),
     "overconfident\n[/h]": (0, _per_h("overconfident_false_outputs")),
+    "false tracks\n[/h]": (0, _per_h("false_tracks")),
+    "below [/h]\n(95 %)": (0, _false_track_bound),
     "sent\n[%]": (1, _mean("sendable_share")),
     "sent:\nmax [m]": (2, _largest("sendable_max_m")),
     "sent:\nmax [deg]": (1, _largest("sendable_max_deg")),
 }
 NOTE = (
-    "Track accuracy: share of the time with a current output within 1 m. Ever accurate, no output, mostly false: "
-    "number of runs. Any return, observable: share of the time searched in searches with 1 or more, with 4 or more "
-    "returns of the drone. Detection rate: share of the time searched in searches whose best candidate is the drone; "
-    "of observable: share of the time of observable searches, any candidate. First accurate: time to the first "
-    "accurate output. Reacquired: after occlusions. Track losses: in sight. 3D RMSE: of runs with an accurate output. "
-    "False: outputs farther than 1 m from the drone; overconfident: by more than three of their own sigmas, too. "
-    "Sent: poses that the autopilot gate accepts, share of the time and largest errors. Medians and 95 % points count "
-    "a failed run as infinite ('never', or longer than the shortest failed run); maxima leave failed runs out. Each "
-    "of several drones counts as a run."
+    "Track accuracy (recall): share of the time with a current output within 1 m. Precision: share of the current "
+    "outputs that are. GOSPA: mean over time, p = 2, cut-off 1 m, so 0.71 m without an output. Ever accurate, no "
+    "output, mostly false: number of runs. Any return, observable: share of the time searched in searches with 1 or "
+    "more, with 4 or more returns of the drone. Detection rate: share of the time searched in searches whose best "
+    "candidate is the drone; of observable: share of the time of observable searches, any candidate. First accurate: "
+    "time to the first accurate output. Reacquired: after occlusions. Track losses: in sight. 3D RMSE: of runs with "
+    "an accurate output. False: outputs farther than 1 m from the drone; overconfident: by more than three of their "
+    "own sigmas, too; false tracks: of such outputs, with the bound of a Poisson process. Sent: poses that the "
+    "autopilot gate accepts, share of the time and largest errors. Medians and 95 % points count a failed run as "
+    "infinite ('never', or longer than the shortest failed run); maxima leave failed runs out. Each of several drones "
+    "counts as a run."
 )
 ROTATION_COLUMNS: Columns = {
     "runs": (0, len),
@@ -164,6 +183,12 @@ RELIABILITY_NOTE = (
     "Candidates of the detector by their probability. A candidate counts once in each row, with the first observation "
     "after which its probability is in that row; it is a drone when it is within 1 m of one then. 95 %: confidence "
     "interval of the share."
+)
+
+
+SCORE_NOTE = (
+    "Brier score and log loss [nats] of the detector's probabilities, over every classification of a candidate, by its "
+    "range from the vehicle. With telemetry: those that were compared with the drone's telemetry."
 )
 
 
@@ -310,3 +335,34 @@ def reliability_table(evaluations: list[Evaluation]) -> Table | None:
     frame["mean probability\n[%]"], frame["drones\n[%]"] = percent["mean"], percent["share"]
     frame["95 %\n[%]"] = percent["share_low"] + " to " + percent["share_high"]
     return Table("reliability of the detector's probabilities", frame, 2, RELIABILITY_NOTE)
+
+
+def probability_scores(evaluations: list[Evaluation]) -> pd.DataFrame:
+    """Brier score and log loss of the detector's probabilities by configuration, telemetry and range."""
+    rows: list[dict[str, object]] = []
+    for config, several in by_config(evaluations).items():
+        runs = {e.run.name: e for e in several}.values()  # several drones of a run have the same candidates
+        outcomes = pd.concat([candidate_outcomes(e) for e in runs])
+        for telemetry in (True, False):
+            for low, high in pairwise(SCORE_RANGES_M):
+                in_band = (outcomes.range_m >= low) & (outcomes.range_m < high) & (outcomes.telemetry == telemetry)
+                here = outcomes[in_band]
+                if not len(here):
+                    continue
+                is_drone = here.is_drone.to_numpy(dtype=np.bool_)
+                brier, log_loss = brier_and_log_loss(here.probability.to_numpy(dtype=np.float64), is_drone)
+                row = {"config": config, "telemetry": telemetry, "low": low, "high": high, "rows": len(here)}
+                rows.append(row | {"drones": int(is_drone.sum()), "brier": brier, "log_loss": log_loss})
+    return pd.DataFrame(rows)
+
+
+def probability_score_table(evaluations: list[Evaluation]) -> Table | None:
+    """Configurations, telemetry and range down; None when no run has candidates with a probability."""
+    rows = probability_scores(evaluations)
+    if rows.empty:
+        return None
+    frame = pd.DataFrame({CONFIG: rows.config, "telemetry": np.where(rows.telemetry, "with", "without")})
+    frame["range [m]"] = rows.low.map("{:g} to ".format) + rows.high.map("{:g}".format)
+    frame["classifications"], frame["of drones"] = rows["rows"].astype(str), rows.drones.astype(str)
+    frame["Brier"], frame["log loss"] = rows.brier.map("{:.4f}".format), rows.log_loss.map("{:.4f}".format)
+    return Table("scores of the detector's probabilities", frame, 3, SCORE_NOTE)

@@ -58,7 +58,7 @@ def _angles(prefix: str, name: str) -> list[Row]:
 SECTIONS: dict[str, dict[Compute, list[Row]]] = {
     "over all time": {
         pose_metrics.track_accuracy: [
-            ("track_accuracy", "track accuracy (time with an output within 1 m)", "%", HIGH),
+            ("track_accuracy", "track accuracy, recall (time with an output within 1 m)", "%", HIGH),
             ("availability", "time with an output", "%", NEITHER),
             ("held_rmse_m", "3D RMSE, last output held", "m", LOW),
             ("held_p95_m", "3D 95 %, last output held", "m", LOW),
@@ -66,6 +66,10 @@ SECTIONS: dict[str, dict[Compute, list[Row]]] = {
             ("before_first_s", "time before any output", "s", NEITHER),
             ("first_accurate_s", "time to the first accurate output", "s", LOW),
             ("longest_inaccurate_s", "longest time without an accurate output", "s", LOW),
+        ],
+        track_metrics.gospa: [
+            ("precision", "precision (current outputs within 1 m)", "%", HIGH),
+            ("gospa_m", "mean GOSPA, p = 2, cut-off 1 m", "m", LOW),
         ],
         pose_metrics.timing: [
             ("first_output_s", "time to the first output", "s", NEITHER),
@@ -115,11 +119,15 @@ SECTIONS: dict[str, dict[Compute, list[Row]]] = {
             ("overconfident_false_outputs", "overconfident false outputs (beyond 3 of their sigmas)", "", LOW),
             ("false_share", "outputs off by more than 1 m", "%", LOW),
         ],
+        track_metrics.false_tracks: [
+            ("false_tracks", "tracks of false outputs", "", LOW),
+            ("false_tracks_per_h", "tracks of false outputs", "/h", LOW),
+            ("false_tracks_below_per_h", "tracks of false outputs, 95 % upper bound", "/h", LOW),
+        ],
     },
     "without a drone": {
         track_metrics.false_alarms: [
             ("false_alarms_per_h", "false alarms", "/h", LOW),
-            ("false_tracks", "false tracks", "", LOW),
         ],
     },
     "searches": {

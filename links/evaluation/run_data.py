@@ -27,6 +27,7 @@ from stages.messages import BranchState
 
 T = TypeVar("T")
 XYZ = ("x_m", "y_m", "z_m")
+TELEMETRY_COLUMN = "over_static_nats"  # of the candidate log: filled where a candidate was compared with telemetry
 NOT_A_RUN = {".mcap", ".rrd", ".html", ".json", ".yaml"}  # files that are given by mistake
 
 
@@ -103,7 +104,9 @@ class RunData:
     config: str = ""  # name of the configuration; empty when it is not known
     vehicle: Trajectory | None = None  # truth, T_world_vehicle
     rotations: RotationLog | None = None
-    candidates: pd.DataFrame | None = None  # of the detector: stamp_ns, candidate, probability, x_m, y_m, z_m
+    candidates: pd.DataFrame | None = (
+        None  # of the detector: stamp_ns, candidate, probability, telemetry, x_m, y_m, z_m
+    )
 
     @property
     def target(self) -> DroneTruth:
@@ -300,6 +303,7 @@ def _read_candidates(path: Path) -> pd.DataFrame:
         + pd.Series(table.text("candidate"), dtype=object)
     )
     rows = pd.DataFrame(table.numbers(("probability", *XYZ)), columns=["probability", *XYZ])
+    rows["telemetry"] = table.filled(TELEMETRY_COLUMN) if TELEMETRY_COLUMN in table else False
     return rows.assign(stamp_ns=table.stamps_ns("stamp_s"), candidate=pd.factorize(names)[0])
 
 

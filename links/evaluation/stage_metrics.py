@@ -31,6 +31,7 @@ from links.evaluation.text_files import Flags, Trajectory
 from stages.geometry.frames import Array64
 
 PROBABILITY_EDGES = (0.0, 0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 0.95, 1.0)  # bins of the reliability table
+SCORE_RANGES_M = (0.0, 15.0, 25.0, 35.0, 70.0)  # bands in which probabilities are scored
 FALSE_DETECTIONS = "false_detections_per_min"
 NO_SEARCH = "no complete search with a drone in reach"
 PUBLISHED, MODULO_90 = "rotation_published", "rotation_modulo_90"
@@ -113,25 +114,35 @@ def _nearest_m(search: Search, path: Array64) -> Array64:
     return np.linalg.norm(search.accepted_xyz_m[:, None] - path, axis=2).min(axis=1, initial=np.inf)
 
 
-def probability_outcomes(e: Evaluation) -> pd.DataFrame:
-    """Outcomes of the detector's probabilities: bin (of PROBABILITY_EDGES), probability, is_drone.
+def candidate_outcomes(e: Evaluation) -> pd.DataFrame:
+    """Every classification of a candidate: candidate, probability, telemetry, range_m, is_drone.
 
-    A candidate counts once in each bin: with its first observation after which its probability is in that bin. It was a
-    drone when it was within `false_m` of one then. Observations at times without truth are left out.
+    It was a drone when it was within `false_m` of one then. Classifications at times without truth are left out.
     """
     run, rows = e.run, e.run.candidates
     if rows is None or (run.truth is None and not run.no_drone):
-        return pd.DataFrame({"bin": [], "probability": [], "is_drone": []})
-    bins = np.searchsorted(PROBABILITY_EDGES, rows.probability, side="right") - 1
+        columns = ("candidate", "probability", "telemetry", "range_m", "is_drone")
+        return pd.DataFrame({name: [] for name in columns})
     known, is_drone = np.ones(len(rows), dtype=np.bool_), np.zeros(len(rows), dtype=np.bool_)
     for path in [d.path for d in run.drones if d.path is not None and not run.no_drone]:
         covered, xyz_m = position_at(path, rows.stamp_ns.to_numpy(), e.limits)
         known &= covered
         is_drone |= covered & (np.linalg.norm(rows[[*XYZ]] - xyz_m, axis=1) < e.limits.false_m)
-    rows = rows.assign(bin=np.clip(bins, 0, len(PROBABILITY_EDGES) - 2), is_drone=is_drone)
-    return rows.loc[known | is_drone, ["candidate", "bin", "probability", "is_drone"]].drop_duplicates(
-        ["candidate", "bin"]
-    )
+    range_m = np.linalg.norm(rows[[*XYZ]], axis=1)
+    columns = {"candidate": rows.candidate, "probability": rows.probability, "telemetry": rows.telemetry}
+    counted = np.nonzero(known | is_drone)[0]
+    return pd.DataFrame(columns | {"range_m": range_m, "is_drone": is_drone}).take(counted)
+
+
+def probability_outcomes(e: Evaluation) -> pd.DataFrame:
+    """Outcomes of the detector's probabilities: bin (of PROBABILITY_EDGES), probability, is_drone.
+
+    A candidate counts once in each bin: with its first observation after which its probability is in that bin.
+    """
+    rows = candidate_outcomes(e)
+    bins = np.searchsorted(PROBABILITY_EDGES, rows.probability, side="right") - 1
+    rows = rows.assign(bin=np.clip(bins, 0, len(PROBABILITY_EDGES) - 2))
+    return rows.drop_duplicates(["candidate", "bin"]).drop(columns=["telemetry", "range_m"])
 
 
 def camera_rotation(e: Evaluation) -> Value | None:

@@ -26,7 +26,7 @@ MAX_COLUMNS = 4  # a terminal shows the metrics of so many runs in columns, of m
 HTML_COLUMNS = 13  # without the labels, so that a page is not wider than a screen
 OBJECT = "evaluation"  # column of `runs_table` with the Evaluation itself
 TIMED_SHARES = ("detection_rate", "observable_detection_rate", "return_share", "observable_share")
-COUNTED_SHARES = (*TIMED_SHARES, "inside_95_share", "rotation_accepted_share", "rotation_inside_95_share")
+COUNTED_SHARES = (*TIMED_SHARES, "precision", "inside_95_share", "rotation_accepted_share", "rotation_inside_95_share")
 HEADLINES = {
     "track_accuracy": "track accuracy %",
     "availability": "output %",

@@ -3,7 +3,8 @@
 An output is false by its distance from the drone alone: a run that states a large sigma has as many as one that states
 none. False outputs whose own covariance excludes the drone are counted separately as overconfident.
 
-Source: grd; limits in association.py, autopilot gate in links/mavlink/poses.
+Source: grd; limits in association.py, autopilot gate in links/mavlink/poses; GOSPA: Rahmathullah, Garcia-Fernandez,
+Svensson, "Generalized optimal sub-pattern assignment metric", FUSION (2017), with alpha = 2.
 """
 
 from __future__ import annotations
@@ -14,10 +15,11 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from links.evaluation.association import EvaluationInput
-from links.evaluation.errors import GRID_NS, rms
+from links.evaluation.association import EvaluationInput, newest
+from links.evaluation.errors import GRID_NS, poisson_upper, position_at, rms
 from links.evaluation.evaluation import (
     NO_OUTPUT,
+    NO_SPAN,
     WITHOUT_DRONE,
     Evaluation,
     Value,
@@ -28,6 +30,7 @@ from links.evaluation.evaluation import (
 from links.evaluation.pose_metrics import NO_MOMENT
 from links.evaluation.run_data import OutputKind
 from links.evaluation.text_files import Stamps
+from stages.geometry.frames import Array64
 from stages.messages import TrackingState
 
 Spans = NDArray[np.int64]  # (m, 2) [ns], rising, without overlap
@@ -61,12 +64,78 @@ def false_outputs(e: Evaluation) -> Value | None:
     return not_evaluated(e.output.why_no_covariance)
 
 
+def false_tracks(e: Evaluation) -> Value | None:
+    """Tracks of false outputs: all of them where there is no drone. With a bound of their rate."""
+    output = e.output
+    rows = np.arange(len(output.poses))
+    if not e.run.no_drone:
+        if e.errors is None:
+            return e.no_truth()
+        rows = e.errors.index.to_numpy()[e.errors.false.to_numpy(dtype=np.bool_)]
+    tracks = None if output.track is None else output.track[rows]
+    count = count_tracks(output.poses.stamps_ns[rows], tracks)
+    e.put("false_tracks", count, len(rows))
+    if e.duration_s is None:
+        return not_evaluated("the recording's length is not known")
+    hours = e.duration_s / 3600
+    e.put_all({"false_tracks_per_h": count / hours, "false_tracks_below_per_h": poisson_upper(count) / hours}, count)
+    return None
+
+
+def gospa(e: Evaluation) -> Value | None:
+    """Mean GOSPA of the current outputs of all tracks against the drone, and the share of them that are at it."""
+    if e.span_ns is None:
+        return not_evaluated(NO_SPAN)
+    if not e.run.no_drone and e.held is None:
+        return e.no_truth()
+    at_ns = np.arange(e.span_ns[0], e.span_ns[1] + 1, GRID_NS) if e.held is None else e.held.stamp_ns.to_numpy()
+    if not len(at_ns):
+        return not_evaluated(NO_MOMENT)
+    distance_m = _distances_m(e, at_ns)
+    e.put("gospa_m", gospa_m(distance_m, not e.run.no_drone, e.limits.false_m).mean(), len(at_ns))
+    current = ~np.isnan(distance_m)
+    if not current.any():
+        return not_applicable(NO_OUTPUT)
+    accurate = int((distance_m <= e.limits.false_m).sum())
+    e.counts["precision"] = accurate, int(current.sum())
+    e.put("precision", 100 * accurate / int(current.sum()), int(current.sum()))
+    return None
+
+
+def gospa_m(distance_m: Array64, drone: bool, cut_off_m: float) -> Array64:
+    """GOSPA (times,) with p = 2 of the estimates at each time, against one drone or none.
+
+    `distance_m` (times, tracks): of each current estimate from the drone, inf where there is none; NaN: no estimate.
+    An estimate beyond the cut-off is false, and the drone missed: each counts cut_off^2 / 2, as every further estimate.
+    """
+    n = (~np.isnan(distance_m)).sum(axis=1)
+    half = cut_off_m**2 / 2
+    if not drone:
+        return np.sqrt(n * half)
+    nearest_m = np.min(np.nan_to_num(distance_m, nan=np.inf), axis=1, initial=np.inf)
+    return np.sqrt(np.where(n == 0, half, (n - 1) * half + np.minimum(nearest_m, cut_off_m) ** 2))
+
+
+def _distances_m(e: Evaluation, at_ns: Stamps) -> Array64:
+    """Distance (times, tracks) of each track's newest output from the drone; NaN: older than `max_age_s`."""
+    output, truth = e.output, e.run.truth
+    tracks = np.ones(len(output.poses), dtype=np.int64) if output.track is None else output.track
+    true_m = None if e.run.no_drone or truth is None else position_at(truth, at_ns, e.limits)[1]
+    columns: list[Array64] = []
+    for track in np.unique(tracks).tolist():
+        poses = output.poses.take(tracks == track)
+        last = newest(at_ns, poses.stamps_ns)
+        current = (last >= 0) & (at_ns - poses.stamps_ns[last] <= e.limits.max_age_s * 1e9)
+        off_m = np.inf if true_m is None else np.linalg.norm(poses.xyz_m[last] - true_m, axis=1)
+        columns.append(np.where(current, off_m, np.nan))
+    return np.column_stack(columns) if columns else np.full((len(at_ns), 1), np.nan)
+
+
 def false_alarms(e: Evaluation) -> Value | None:
-    """Outputs and tracks in a recording without a drone, where all of them are false."""
+    """Outputs in a recording without a drone, where all of them are false."""
     if not e.run.no_drone:
         return not_applicable("for recordings without a drone (--no-drone declares that there was none)")
     outputs = len(e.output.poses)
-    e.put("false_tracks", count_tracks(e.output.poses.stamps_ns, e.output.track), outputs)
     if outputs:
         e.findings.append(f"{outputs} outputs though there was no drone")
     if e.duration_s is None:

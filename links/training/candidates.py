@@ -111,10 +111,14 @@ def _read(folder: Path, index: int, thin: bool) -> pd.DataFrame:
     frame = pd.read_csv(file, dtype={"stamp_s": str})
     if absent := [name for name in NAMES if name not in frame.columns]:
         raise LinkError(f"{file}: no feature {', '.join(absent)}; replay the recording with this version of grd")
-    for name in REQUIRED:
-        missing = np.isnan(frame[name].to_numpy(dtype=np.float64))
-        if missing.any():
-            raise LinkError(f"{file}:{int(missing.argmax()) + 2}: {name} is missing")
+    for name in NAMES:
+        values = np.asarray(pd.to_numeric(frame[name], errors="coerce"), dtype=np.float64)
+        empty = np.asarray(frame[name].isna())
+        wrong = np.isinf(values) | (np.isnan(values) & (~empty | (name in REQUIRED)))
+        if wrong.any():
+            row = int(wrong.argmax())
+            text = "missing" if empty[row] else f"'{frame[name].iloc[row]}', not a finite number"
+            raise LinkError(f"{file}:{row + 2}: {name} is {text}")
     frame["stamp_ns"] = [int(s) * 10**9 + int(f.ljust(9, "0")) for s, f in (t.split(".") for t in frame.stamp_s)]
     known, frame["is_drone"] = _labels(folder, frame)
     frame = frame.assign(run=index, seed=_seed(folder)).loc[known]

@@ -13,10 +13,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from flow.link import LinkError
 from links.cli.console import err, out, report_errors
 
 if TYPE_CHECKING:
     from links.training.candidates import CandidateRows
+    from stages.detect.trained.model import DetectorModel
     from stages.geometry.frames import Array64
 
 LISTED_RUNS = 8
@@ -34,8 +36,15 @@ def train_detector(
         typer.Option("--held-out", help="Folder of runs that are scored and not trained on; repeatable."),
     ] = None,
     left_out: Annotated[
-        list[str] | None, typer.Option("--without", help="Feature that the model does not use (ablation); repeatable.")
+        list[str] | None, typer.Option("--without", help="Feature that the model does not use; repeatable.")
     ] = None,
+    start_file: Annotated[
+        Path | None,
+        typer.Option("--start", help="Weights file of an earlier training: the runs change it as far as they differ."),
+    ] = None,
+    ablation: Annotated[
+        bool, typer.Option("--ablation", help="Also train without each group of features, and score these models.")
+    ] = False,
 ) -> None:
     """Train the detector's model and score it on held-out runs.
 
@@ -49,18 +58,23 @@ def train_detector(
 
     from links.training.candidates import lidar_model_of, read_candidates
     from links.training.fit import STRENGTHS, predicted, train
+    from stages.detect.trained.features import FEATURES, GROUPS
+
+    if ablation and not held_out:
+        raise LinkError("--ablation needs --held-out: the models without a group are scored on these runs")
 
     rows, lidar_model = read_candidates(runs), lidar_model_of(runs)
     folders = [run for folder in held_out or [] for run in sorted(folder.iterdir()) if run.is_dir()]
     trained: dict[str, Any] = {
-        "command": _command(runs, out_file, held_out or [], left_out or []),
+        "command": _command(runs, out_file, held_out or [], left_out or [], start_file, ablation),
         "seeds": sorted({int(seed) for seed in rows.seed}),
         "runs": len(runs),
         "rows": len(rows.X),
         "drones": int(rows.is_drone.sum()),
         "libraries": {name: importlib.metadata.version(name) for name in LIBRARIES},
     }
-    model = train(rows, trained, left_out or [], lidar_model)
+    start = None if start_file is None else _read_model(start_file)
+    model = train(rows, trained, left_out or [], lidar_model, start)
     if trained["strength"] in (STRENGTHS[0], STRENGTHS[-1]):
         err.print(
             f"warning: the best strength of the penalty, {trained['strength']:g}, is at an end of those tried "
@@ -70,6 +84,10 @@ def train_detector(
     if folders:
         unseen = read_candidates(folders)
         trained["held_out"] = _compared(unseen, predicted(model, unseen))
+        for group in ("nothing", *GROUPS) if ablation else ():
+            names = [feature.name for feature in FEATURES if feature.group == group]
+            less = train(rows, {}, [*(left_out or []), *names], lidar_model, start, [trained["strength"]])
+            trained.setdefault("ablation", {})[group] = _ablated(group, unseen, predicted(less, unseen))
         model = model.model_copy(update={"trained": trained})
     text = yaml.safe_dump(
         {"stages": {"detect": {"config": {"model": model.model_dump(mode="json")}}}}, sort_keys=False, width=2000
@@ -78,15 +96,52 @@ def train_detector(
     out.print(f"{out_file}: {len(rows.X)} rows of {len(runs)} runs", markup=False)
 
 
-def _command(runs: list[Path], out_file: Path, held_out: list[Path], left_out: list[str]) -> str:
+def _read_model(file: Path) -> DetectorModel:
+    """The model of a weights file. LinkError: it is none, or of other features."""
+    import yaml
+    from pydantic import ValidationError
+
+    from stages.detect.trained.model import DetectorModel
+
+    try:
+        return DetectorModel.model_validate(yaml.safe_load(file.read_text())["stages"]["detect"]["config"]["model"])
+    except ValidationError as error:
+        raise LinkError(f"{file}: {'; '.join(str(e['msg']) for e in error.errors())}") from None
+    except (OSError, yaml.YAMLError, KeyError, TypeError) as error:
+        raise LinkError(f"{file}: not a weights file of `grd train-detector`: {error!r}") from None
+
+
+def _command(
+    runs: list[Path],
+    out_file: Path,
+    held_out: list[Path],
+    left_out: list[str],
+    start_file: Path | None,
+    ablation: bool,
+) -> str:
     """The command with all its options; many runs are counted, not listed."""
     options = ["-o", str(out_file)]
     for folder in held_out:
         options += ["--held-out", str(folder)]
     for name in left_out:
         options += ["--without", name]
+    options += [] if start_file is None else ["--start", str(start_file)]
+    options += ["--ablation"] if ablation else []
     listed = shlex.join(map(str, runs)) if len(runs) <= LISTED_RUNS else f"RUNS ({len(runs)})"
     return f"grd train-detector {listed} {shlex.join(options)}"
+
+
+def _ablated(group: str, unseen: CandidateRows, probability: Array64) -> dict[str, list[float]]:
+    """Brier score and log loss of a model without a group of features, with and without telemetry; printed."""
+    from links.evaluation.errors import brier_and_log_loss
+
+    found: dict[str, list[float]] = {}
+    for name, here in (("with telemetry", unseen.with_telemetry), ("without telemetry", ~unseen.with_telemetry)):
+        if here.any():
+            brier, log_loss = brier_and_log_loss(probability[here], unseen.is_drone[here])
+            found[name] = [round(brier, 5), round(log_loss, 4)]
+            out.print(f"without '{group}', {name}: Brier {brier:.5f}, log loss {log_loss:.4f}", markup=False)
+    return found
 
 
 def _compared(unseen: CandidateRows, probability: Array64) -> list[dict[str, Any]]:

@@ -20,6 +20,8 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from flow.link import LinkError
+from links.evaluation.errors import brier_and_log_loss
+from links.evaluation.stage_metrics import SCORE_RANGES_M
 from links.training.candidates import CandidateRows
 from stages.detect.trained.features import FEATURES, NAMES, RANGE, TELEMETRY, VERSION
 from stages.detect.trained.model import ALTERNATIVES, ANY, FAR, NEAR, At, DetectorModel, Term, farness
@@ -35,7 +37,6 @@ PRIOR_PENALTY = 0.02  # assumed; of the priors, relative to the other parameters
 STRENGTHS = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0)  # of the penalty
 FOLDS = 3
 EASY_SHARE = 0.05  # assumed; of the single observations without telemetry that are used; they are most of all rows
-RANGES_M = (0.0, 15.0, 25.0, 35.0, 70.0)  # bands of the scores
 USED: tuple[tuple[str, ...], ...] = (  # features of each alternative
     (
         "existence_nats", "false_per_s", "range_m", "scan_passes", "age_s", "first_returns", "return_ratio",
@@ -85,20 +86,31 @@ class _Column:
 
 
 def train(
-    rows: CandidateRows, trained: dict[str, Any], left_out: Sequence[str] = (), lidar_model: LidarModel = "VLP-16"
+    rows: CandidateRows,
+    trained: dict[str, Any],
+    left_out: Sequence[str] = (),
+    lidar_model: LidarModel = "VLP-16",
+    start: DetectorModel | None = None,
+    strengths: Sequence[float] | None = None,
 ) -> DetectorModel:
-    """The model of these rows, of runs with this LiDAR. `left_out`: features that it does not use (ablation)."""
+    """The model of these rows, of runs with this LiDAR. `left_out`: features that it does not use (ablation).
+
+    `start`: a model of other rows; the penalty pulls to its weights. `strengths`: of the penalty, to choose from (None:
+    STRENGTHS).
+    """
     seeds = np.unique(rows.seed)
     if min(rows.is_drone.sum(), (~rows.is_drone).sum()) < 100 or len(seeds) < 2:
         raise LinkError("training needs at least 100 rows of drones, 100 of others, and two seeds")
     easy = ~rows.is_drone & ~rows.with_telemetry & (rows.feature("scan_passes") <= 1)
     kept = ~easy | (np.random.default_rng(0).uniform(size=len(easy)) < EASY_SHARE)
     weight = np.where(easy, 1.0 / EASY_SHARE, 1.0)[kept]
-    columns = _columns(rows.take(kept), left_out)
+    columns = _columns(rows.take(kept), left_out, start)
     A, y = _design(rows.X[kept], columns), rows.is_drone[kept]
     fold = np.searchsorted(seeds, rows.seed[kept]) % min(FOLDS, len(seeds))
-    losses = {strength: _left_out_loss(A, y, weight, fold, columns, strength) for strength in STRENGTHS}
-    strength = min(losses, key=lambda s: losses[s])
+    strengths = strengths or STRENGTHS
+    several = strengths if len(strengths) > 1 else ()
+    losses = {strength: _left_out_loss(A, y, weight, fold, columns, strength) for strength in several}
+    strength = min(losses, key=lambda s: losses[s]) if losses else strengths[0]
     theta = _fitted(A, y, weight, columns, strength)
     trained["strength"], trained["left_out_log_loss"] = strength, {s: round(v, 5) for s, v in losses.items()}
     return _model(columns, theta, trained, lidar_model)
@@ -111,46 +123,65 @@ def predicted(model: DetectorModel, rows: CandidateRows) -> Array64:
 
 def scores(rows: CandidateRows, probability: Array64) -> list[Score]:
     """Brier score and log loss [nats] by range band, with and without telemetry."""
-    p = np.clip(probability, 1e-6, 1 - 1e-6)
-    brier, loss = (p - rows.is_drone) ** 2, -np.log(np.where(rows.is_drone, p, 1 - p))
     found: list[Score] = []
     for telemetry in (True, False):
-        for low, high in pairwise(RANGES_M):
+        for low, high in pairwise(SCORE_RANGES_M):
             here = (rows.with_telemetry == telemetry) & (rows.feature("range_m") >= low)
             here &= rows.feature("range_m") < high
             if here.any():
                 name = f"{low:.0f} to {high:.0f} m, {'with' if telemetry else 'without'} telemetry"
                 drones = int(rows.is_drone[here].sum())
-                found.append(Score(name, int(here.sum()), drones, float(brier[here].mean()), float(loss[here].mean())))
+                found.append(
+                    Score(name, int(here.sum()), drones, *brier_and_log_loss(probability[here], rows.is_drone[here]))
+                )
     return found
 
 
-def _columns(rows: CandidateRows, left_out: Sequence[str]) -> list[_Column]:
-    """The parameters, with knots at quantiles of the drones and three times as many other rows."""
+def _columns(rows: CandidateRows, left_out: Sequence[str], start: DetectorModel | None) -> list[_Column]:
+    """The parameters, with knots at quantiles of the drones and three times as many other rows, or those of `start`."""
     rng, others = np.random.default_rng(0), np.nonzero(~rows.is_drone)[0]
     drones = np.nonzero(rows.is_drone)[0]
     some = np.concatenate([drones, rng.choice(others, min(3 * len(drones), len(others)), replace=False)])
+    before = {(t.alternative, t.feature, t.at): t for t in start.terms} if start is not None else {}
     columns: list[_Column] = []
     for alternative, names in enumerate(USED):
-        for with_telemetry in (0.0, 1.0):
-            mean = 2.0 * with_telemetry
-            columns.append(_Column(alternative, "", ANY, with_telemetry, with_telemetry, 0, mean))
+        for with_telemetry in (0, 1):
+            mean = 2.0 * with_telemetry if start is None else start.priors[alternative][with_telemetry]
+            columns.append(_Column(alternative, "", ANY, float(with_telemetry), float(with_telemetry), 0, mean))
         for name in names:
             if name in left_out:
                 continue
-            x, share = rows.feature(name)[some], LLR_SHARE.get(name, 0.0)
-            known = x[~np.isnan(x)]
-            if len(known) < LEAST_KNOWN:
-                continue
-            is_llr = name in LLR_SHARE
-            knots = np.array(LLR_KNOTS) if is_llr else np.unique(_rounded(np.quantile(known, _levels())))
-            sign = FEATURES[NAMES.index(name)].monotone
             for at in (NEAR, FAR) if name in RANGED else (ANY,):
-                ramps = pairwise(knots.tolist())
-                columns += [_Column(alternative, name, at, a, b, sign, share * (b - a)) for a, b in ramps]
-                if not name.endswith("_nats") and name != "misfit":
-                    columns.append(_Column(alternative, name, at, np.nan, np.nan, 0, 0.0))
+                term = before.get((alternative, name, at))
+                columns += _of_term(term) if term is not None else _new_term(alternative, name, at, rows, some)
     return columns
+
+
+def _new_term(alternative: int, name: str, at: At, rows: CandidateRows, some: NDArray[np.int64]) -> list[_Column]:
+    """The parameters of a feature, by its values in `some` rows; none where it is hardly ever known."""
+    x, share = rows.feature(name)[some], LLR_SHARE.get(name, 0.0)
+    known = x[~np.isnan(x)]
+    if len(known) < LEAST_KNOWN:
+        return []
+    knots = np.array(LLR_KNOTS) if name in LLR_SHARE else np.unique(_rounded(np.quantile(known, _levels())))
+    sign = FEATURES[NAMES.index(name)].monotone
+    ramps = [_Column(alternative, name, at, a, b, sign, share * (b - a)) for a, b in pairwise(knots.tolist())]
+    return ramps + _missing(alternative, name, at, 0.0)
+
+
+def _of_term(term: Term) -> list[_Column]:
+    """The parameters of a term of the model to start from."""
+    sign, name = FEATURES[NAMES.index(term.feature)].monotone, term.feature
+    steps = zip(pairwise(term.knots), pairwise(term.values), strict=True)
+    ramps = [_Column(term.alternative, name, term.at, a, b, sign, after - value) for (a, b), (value, after) in steps]
+    return ramps + _missing(term.alternative, name, term.at, term.missing)
+
+
+def _missing(alternative: int, name: str, at: At, mean: float) -> list[_Column]:
+    """The parameter of a missing feature; a log likelihood ratio that is missing is no evidence."""
+    if name.endswith("_nats") or name == "misfit":
+        return []
+    return [_Column(alternative, name, at, np.nan, np.nan, 0, mean)]
 
 
 def _levels() -> Array64:

@@ -80,7 +80,6 @@ class Candidate:
     false_per_s: float = LEAST_FALSE_PER_S  # rate of false returns at its range, at its last observation
     passed_pulses: float = 0.0  # pulses through its middle in scan passes without a return
     observations: int = 0
-    single_returns: int = 0  # observations with one return
     total_extent_m: float = 0.0  # sum and largest of its observations
     largest_extent_m: float = 0.0
     features: Array64 = field(default_factory=lambda: np.zeros(0))  # at its newest classification
@@ -157,7 +156,6 @@ class Candidate:
     def add_observation(self, s: Observation) -> None:
         """Add the evidence of one observation, without the filter update."""
         self.observations += 1
-        self.single_returns += s.returns == 1
         self.total_extent_m += s.extent_m
         self.largest_extent_m = max(self.largest_extent_m, s.extent_m)
         self.returns += s.returns

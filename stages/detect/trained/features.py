@@ -21,7 +21,7 @@ from stages.detect.flight import Motion, straight_flight
 from stages.detect.motion_log_ratios import MotionLogRatios
 from stages.geometry.frames import Array64
 
-VERSION = 2
+VERSION = 3
 PULSE_RAD = math.radians(0.2)  # between two pulses of a laser: VLP-16, 600 rpm; see `DetectorModel.lidar_model`
 NONE_M = 4.0  # written where no large object is near
 NOT_DISPLACED_NATS = 3.0  # cap of the log ratio over a static object that may seem to move as far
@@ -33,66 +33,58 @@ class Feature(NamedTuple):
     name: str
     monotone: int
     text: str
+    group: str  # of features that an ablation leaves out together
 
 
 FEATURES: tuple[Feature, ...] = (
-    Feature("range_m", 0, "range"),
-    Feature("existence_nats", 1, "existence by returns and pass-throughs"),
-    Feature("false_per_s", -1, "false returns at this range"),
-    Feature("scan_passes", 0, "scan passes with a return"),
-    Feature("age_s", 0, "time since the first observation"),
-    Feature("first_returns", 0, "returns of the first scan pass"),
-    Feature("return_ratio", 0, "returns over those of a beam across the drone"),
-    Feature("single_share", 0, "share of scan passes with one return"),
-    Feature("return_count_nats", 0, "returns of each scan pass, as a drone's and not a wire's"),
-    Feature("passed_pulses", -1, "pulses that passed through its middle"),
-    Feature("missed_returns", -1, "returns expected of these pulses"),
-    Feature("free_sectors", 1, "sectors around it that pulses flew through"),
-    Feature("least_free", 0, "scan passes in which its least observed sector was free"),
-    Feature("neighbour_score", -1, "objects next to it"),
-    Feature("isolated_score", 0, "recent scan passes without a neighbour"),
-    Feature("large_object_m", 0, "distance to a wall, crown or trunk"),
-    Feature("large_object_share", -1, "share of scan passes next to a large object"),
-    Feature("extent_ratio", 0, "mean extent over the drone's"),
-    Feature("largest_extent_ratio", 0, "largest extent over the drone's"),
-    Feature("too_long_passes", -1, "scan passes in which it was longer than the drone"),
-    Feature("round_chords", -1, "smooth, round chords"),
-    Feature("rough_chords", 0, "chords that are not smooth"),
-    Feature("speed_mps", 0, "speed over ground"),
-    Feature("speed_sigma_mps", 0, "sigma of its speed"),
-    Feature("relative_speed_mps", 0, "speed relative to the vehicle"),
-    Feature("acceleration_mps2", 0, "acceleration"),
-    Feature("acceleration_sigma_mps2", 0, "sigma of its acceleration"),
-    Feature("fastest_mps", 0, "highest speed that it significantly had"),
-    Feature("hardest_mps2", 0, "highest acceleration that it significantly had"),
-    Feature("top_mps", 0, "speed that it reaches, with its turn"),
-    Feature("top_sigma_mps", 0, "sigma of that speed"),
-    Feature("calm_s", 1, "time in which it flew more calmly than a bird cruises"),
-    Feature("steady_s", 1, "time in which it flew straight"),
-    Feature("scatter_m", 0, "scatter about a smooth path"),
-    Feature("displacement_m", 0, "displacement since the first observation kept"),
-    Feature("straight_mps", 0, "mean velocity since then"),
-    Feature("straight_sigmas", 0, "the same in its sigmas"),
-    Feature("climb_mps", 0, "mean vertical velocity"),
-    Feature("moves", 0, "it moved over ground"),
-    Feature("motion_known", 0, "the vehicle's motion is known"),
-    Feature("near_rejected", -1, "a rejected object near it"),
-    Feature("revisited", -1, "a rejected object at its position"),
-    Feature("passes_since_reacquired", 1, "scan passes since it was reacquired"),
-    Feature("over_static_nats", 1, "moves as the drone's odometry, not as a static object"),
-    Feature("over_bird_nats", 1, "moves as the drone's odometry, not as a bird"),
-    Feature("over_balloon_nats", 1, "moves as the drone's odometry, not as a balloon"),
-    Feature("over_wire_nats", 1, "moves as the drone's odometry, not along a wire"),
-    Feature("flight_nats", 1, "agreed with the drone's odometry in open air"),
-    Feature("misfit", -1, "residual from the drone's odometry"),
-    Feature("odometry_displacement_m", 0, "displacement by the drone's odometry"),
-    Feature("displaced_nats", 1, "moves as the drone's odometry, farther than a static object may seem to"),
-    Feature("displaced_m", 0, "displacement by odometry beyond what a static object may seem to move"),
+    Feature("range_m", 0, "range", "range"),
+    Feature("existence_nats", 1, "existence by returns and pass-throughs", "existence"),
+    Feature("false_per_s", -1, "false returns at this range", "existence"),
+    Feature("scan_passes", 0, "scan passes with a return", "existence"),
+    Feature("age_s", 0, "time since the first observation", "existence"),
+    Feature("first_returns", 0, "returns of the first scan pass", "returns"),
+    Feature("return_ratio", 0, "returns over those of a beam across the drone", "returns"),
+    Feature("return_count_nats", 0, "returns of each scan pass, as a drone's and not a wire's", "returns"),
+    Feature("passed_pulses", -1, "pulses that passed through its middle", "existence"),
+    Feature("missed_returns", -1, "returns expected of these pulses", "existence"),
+    Feature("free_sectors", 1, "sectors around it that pulses flew through", "surroundings"),
+    Feature("least_free", 0, "scan passes in which its least observed sector was free", "surroundings"),
+    Feature("neighbour_score", -1, "objects next to it", "surroundings"),
+    Feature("isolated_score", 0, "recent scan passes without a neighbour", "surroundings"),
+    Feature("large_object_m", 0, "distance to a wall, crown or trunk", "surroundings"),
+    Feature("large_object_share", -1, "share of scan passes next to a large object", "surroundings"),
+    Feature("extent_ratio", 0, "mean extent over the drone's", "size and shape"),
+    Feature("largest_extent_ratio", 0, "largest extent over the drone's", "size and shape"),
+    Feature("too_long_passes", -1, "scan passes in which it was longer than the drone", "size and shape"),
+    Feature("round_chords", -1, "smooth, round chords", "size and shape"),
+    Feature("rough_chords", 0, "chords that are not smooth", "size and shape"),
+    Feature("relative_speed_mps", 0, "speed relative to the vehicle", "motion"),
+    Feature("acceleration_mps2", 0, "acceleration", "motion"),
+    Feature("fastest_mps", 0, "highest speed that it significantly had", "motion"),
+    Feature("hardest_mps2", 0, "highest acceleration that it significantly had", "motion"),
+    Feature("top_mps", 0, "speed that it reaches, with its turn", "motion"),
+    Feature("calm_s", 1, "time in which it flew more calmly than a bird cruises", "motion"),
+    Feature("steady_s", 1, "time in which it flew straight", "motion"),
+    Feature("scatter_m", 0, "scatter about a smooth path", "motion"),
+    Feature("displacement_m", 0, "displacement since the first observation kept", "motion"),
+    Feature("straight_mps", 0, "mean velocity since then", "motion"),
+    Feature("straight_sigmas", 0, "the same in its sigmas", "motion"),
+    Feature("climb_mps", 0, "mean vertical velocity", "motion"),
+    Feature("moves", 0, "it moved over ground", "motion"),
+    Feature("near_rejected", -1, "a rejected object near it", "surroundings"),
+    Feature("revisited", -1, "a rejected object at its position", "surroundings"),
+    Feature("passes_since_reacquired", 1, "scan passes since it was reacquired", "telemetry"),
+    Feature("over_static_nats", 1, "moves as the drone's odometry, not as a static object", "telemetry"),
+    Feature("over_bird_nats", 1, "moves as the drone's odometry, not as a bird", "telemetry"),
+    Feature("over_balloon_nats", 1, "moves as the drone's odometry, not as a balloon", "telemetry"),
+    Feature("misfit", -1, "residual from the drone's odometry", "telemetry"),
+    Feature("displaced_nats", 1, "moves as the drone's odometry, farther than a static one seems to", "telemetry"),
 )
+GROUPS = tuple(dict.fromkeys(feature.group for feature in FEATURES))
 NAMES = tuple(feature.name for feature in FEATURES)
 RANGE = NAMES.index("range_m")
 TELEMETRY = NAMES.index("over_static_nats")  # NaN: not compared with telemetry
-NO_TELEMETRY = (math.nan,) * 9
+NO_TELEMETRY = (math.nan,) * 5
 
 
 def features_of(c: Candidate, span_m: float, motion_known: bool) -> Array64:
@@ -106,9 +98,7 @@ def features_of(c: Candidate, span_m: float, motion_known: bool) -> Array64:
     speed, sigmas, climb = straight_flight(c.path_ns, c.path_m, c.range_m)
     ratios = c.log_ratios
     since = math.nan if not c.reacquired_at else passes - c.reacquired_at
-    telemetry = (
-        NO_TELEMETRY if ratios is None else (*ratios[:4], c.flight_log_ratio, *ratios[4:], *displaced(c, ratios))
-    )
+    telemetry = NO_TELEMETRY if ratios is None else (*ratios[:3], ratios.misfit, displaced_nats(c, ratios))
     return np.array(
         [
             c.range_m,
@@ -118,7 +108,6 @@ def features_of(c: Candidate, span_m: float, motion_known: bool) -> Array64:
             (c.path_ns[-1] - c.born_ns) * 1e-9,
             c.first_returns,
             c.returns / c.observations * PULSE_RAD * c.range_m / span_m,
-            c.single_returns / c.observations,
             c.return_count_nats,
             c.passed_pulses,
             c.missed_returns,
@@ -133,15 +122,11 @@ def features_of(c: Candidate, span_m: float, motion_known: bool) -> Array64:
             c.too_long_passes,
             c.round_chords,
             c.rough_chords,
-            m.speed_mps,
-            m.speed_sigma_mps,
             slower.speed_mps,
             m.acceleration_mps2,
-            m.acceleration_sigma_mps2,
             c.fastest_mps,
             c.hardest_mps2,
             slower.top_mps,
-            slower.top_sigma_mps,
             c.calm_s,
             c.steady_s,
             m.spread_m,
@@ -150,7 +135,6 @@ def features_of(c: Candidate, span_m: float, motion_known: bool) -> Array64:
             sigmas,
             climb,
             c.moves(motion_known),
-            motion_known,
             c.near_rejected,
             c.revisited,
             since,
@@ -160,15 +144,15 @@ def features_of(c: Candidate, span_m: float, motion_known: bool) -> Array64:
     )
 
 
-def displaced(c: Candidate, ratios: MotionLogRatios) -> tuple[float, float]:
-    """(log ratio over the static object that would be visible at its range [nats], displacement beyond its own [m]).
+def displaced_nats(c: Candidate, ratios: MotionLogRatios) -> float:
+    """Log ratio [nats] of telemetry over the static object that would be visible at the candidate's range.
 
     A lamp whose pole is invisible, or a wire, may seem to move (`Candidate.apparent_motion_m`): a drone's odometry that
     moved less is little evidence, unless the candidate agreed with it in open air before.
     """
-    beyond_m = ratios.displacement_m - c.apparent_motion_m
     nats = over_visible_support(c, ratios, WIRE_M, SINGLE_RETURN_WIRE_M)
-    return max(nats if beyond_m > 0.0 else min(nats, NOT_DISPLACED_NATS), c.flight_log_ratio), beyond_m
+    moved = ratios.displacement_m > c.apparent_motion_m
+    return max(nats if moved else min(nats, NOT_DISPLACED_NATS), c.flight_log_ratio)
 
 
 NOT_MEASURED = Motion(math.nan, math.nan, math.nan, math.nan, math.nan)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from flow.link import LinkError, Run
-from links.evaluation.groups import reliability, reliability_table
+from links.evaluation.groups import probability_score_table, probability_scores, reliability, reliability_table
 from links.evaluation.run_data import read_run
 from links.runs.results import CANDIDATES_FILE, Results
 from stages.messages import CandidateLog
@@ -94,6 +94,22 @@ def test_the_table_has_probabilities_and_shares_of_drones(tmp_path):
     assert table.frame.to_numpy().tolist() == [[".yaml", "0.5 to 0.7", "1", "60.0", "100.0", "20.7 to 100.0"]]
     folders = [str(run_with_candidates(tmp_path / name, [(1.0, 1, 0.6, 0.0)])) for name in "bc"]
     assert "reliability of the detector's probabilities" in grd("evaluate", *folders, "--by", "config")
+
+
+def test_probabilities_are_scored_by_range_with_and_without_telemetry(tmp_path):
+    folder = run_with_candidates(tmp_path / "a", [(1.0, 1, 0.8, 0.0), (2.0, 1, 0.6, 0.0), (2.0, 2, 0.25, 9.0)])
+    rows = (folder / CANDIDATES_FILE).read_text().splitlines()
+    filled = [f"{rows[0]},over_static_nats", f"{rows[1]},1.5", f"{rows[2]},", f"{rows[3]},-2.0"]
+    (folder / CANDIDATES_FILE).write_text("\n".join(filled) + "\n")
+    scores = {(r.telemetry, r.low): r for r in probability_scores(all_evaluated(folder)).itertuples()}
+    assert set(scores) == {(True, 0.0), (True, 15.0), (False, 0.0)}  # the third is 17 m away
+    assert scores[(True, 0.0)].brier == pytest.approx(0.2**2)
+    assert scores[(True, 0.0)].log_loss == pytest.approx(-np.log(0.8))
+    assert (scores[(True, 15.0)].drones, scores[(True, 15.0)].brier) == (0, pytest.approx(0.25**2))
+    assert scores[(False, 0.0)].log_loss == pytest.approx(-np.log(0.6))
+    table = probability_score_table(all_evaluated(folder))
+    assert table is not None
+    assert table.frame.to_numpy()[0].tolist() == [".yaml", "with", "0 to 15", "1", "1", "0.0400", "0.2231"]
 
 
 def candidate_log(numbers, probability, life=7):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import math
 
 import numpy as np
@@ -12,7 +13,14 @@ from flow.link import LinkError
 from links.evaluation.errors import poisson_upper
 from links.evaluation.evaluation import MetricStatus
 from links.evaluation.run_data import read_run
-from links.evaluation.track_metrics import count_tracks, longest_gap_s, merged, reacquisition_times_s, track_losses
+from links.evaluation.track_metrics import (
+    count_tracks,
+    gospa_m,
+    longest_gap_s,
+    merged,
+    reacquisition_times_s,
+    track_losses,
+)
 from tests.links.evaluation.made_runs import evaluated, make_run, truth_at, value
 
 S = 1_000_000_000
@@ -173,3 +181,54 @@ def test_the_upper_bound_of_a_rate_leaves_5_percent():
         few = sum(math.exp(-mean) * mean**k / math.factorial(k) for k in range(events + 1))
         assert few == pytest.approx(0.05)
         assert stats.chi2.cdf(2 * mean, 2 * events + 2) == pytest.approx(0.95)
+
+
+def test_gospa_counts_an_error_a_miss_and_each_false_estimate():
+    nan = math.nan
+    distance_m = np.array([[0.3, nan], [nan, nan], [5.0, nan], [0.3, 7.0], [0.6, 0.3]])
+    expected = [0.3, math.sqrt(0.5), 1.0, math.sqrt(0.5 + 0.09), math.sqrt(0.5 + 0.09)]
+    assert gospa_m(distance_m, True, 1.0) == pytest.approx(expected)
+    assert gospa_m(distance_m, False, 1.0) == pytest.approx(np.sqrt([0.5, 0.0, 0.5, 1.0, 1.0]))
+
+
+def test_gospa_is_that_of_stone_soup():
+    metric = pytest.importorskip("stonesoup.metricgenerator.ospametric").GOSPAMetric(p=2, c=1.0)
+    state = pytest.importorskip("stonesoup.types.state").State
+    rng, when = np.random.default_rng(4), datetime.datetime(2025, 6, 1)
+    compared = 0
+    for _ in range(200):
+        found = rng.normal(0, 0.6, (rng.integers(0, 5), 3))
+        drone = bool(rng.integers(0, 2))
+        truth = [state(np.zeros(3), timestamp=when)] if drone else []
+        if not len(found) and not drone:
+            continue
+        theirs = metric.compute_gospa_metric([state(xyz, timestamp=when) for xyz in found], truth)[0].value["distance"]
+        distance_m = np.linalg.norm(found, axis=1)[None] if len(found) else np.full((1, 1), np.nan)
+        assert gospa_m(distance_m, drone, 1.0)[0] == pytest.approx(float(theirs))
+        compared += 1
+    assert compared > 100
+
+
+def test_precision_and_gospa_of_a_run_with_a_second_track_that_is_false(tmp_path):
+    t = np.concatenate([EIGHT_HZ, EIGHT_HZ])
+    xyz = np.concatenate([truth_at(EIGHT_HZ), truth_at(EIGHT_HZ) + np.array([0.0, 8.0, 0.0])])
+    tracks = np.repeat([1, 2], len(EIGHT_HZ))
+    one = evaluated(make_run(tmp_path / "one", EIGHT_HZ, truth_at(EIGHT_HZ)))
+    two = evaluated(make_run(tmp_path / "two", t, xyz, tracks=tracks))
+    assert value(one, "precision") == 100.0
+    assert value(two, "precision") == pytest.approx(50.0)
+    assert value(one, "gospa_m") < 0.15 < math.sqrt(0.5) < value(two, "gospa_m") < 0.75
+    assert (value(one, "false_tracks"), value(two, "false_tracks")) == (0, 1)
+
+
+def test_false_tracks_have_a_rate_and_a_bound_with_and_without_a_drone(tmp_path):
+    t = np.array([0.0, 0.5, 4.0, 4.5])
+    beside = evaluated(make_run(tmp_path / "a", t, truth_at(t) + np.array([0.0, 5.0, 0.0])))
+    empty = evaluated(make_run(tmp_path / "b", t, truth_at(t), truth="no drone"))
+    for e in (beside, empty):
+        assert value(e, "false_tracks") == 2  # a pause of more than a second
+        assert value(e, "false_tracks_per_h") == pytest.approx(2 * 360)
+        assert value(e, "false_tracks_below_per_h") == pytest.approx(poisson_upper(2) * 360)
+    none = evaluated(make_run(tmp_path / "c", [], []))
+    assert value(none, "false_tracks_below_per_h") == pytest.approx(-math.log(0.05) * 360)
+    assert value(none, "gospa_m") == pytest.approx(math.sqrt(0.5))

@@ -15,8 +15,8 @@ from links.cli.app import app
 from links.evaluation.text_files import NO_DRONE
 from links.runs import results
 from links.training.candidates import FIRST_ROWS, lidar_model_of, read_candidates
-from links.training.fit import scores, train
-from stages.detect.trained.features import FEATURES, NAMES
+from links.training.fit import USED, scores, train
+from stages.detect.trained.features import FEATURES, GROUPS, NAMES, TELEMETRY
 from stages.detect.trained.model import DetectorModel
 
 DRONE_M = np.array([5.0, 8.0, 10.0])
@@ -164,10 +164,71 @@ def test_runs_that_cannot_be_used_are_named(tmp_path, runs):
         read_candidates([write_run(tmp_path / "old-s1-x", 1, drop=("scatter_m",))])
     with pytest.raises(LinkError, match="two seeds"):
         train(read_candidates(runs[:1]), {})
+
+
+@pytest.mark.parametrize(
+    ("column", "cell", "expected"),
+    [
+        ("range_m", "", "range_m is missing"),
+        ("range_m", "nan", "range_m is missing"),
+        ("top_mps", "fast", "top_mps is 'fast', not a finite number"),
+        ("top_mps", "inf", "top_mps is 'inf', not a finite number"),
+    ],
+)
+def test_a_value_that_is_no_number_is_named_with_its_line(tmp_path, column, cell, expected):
     broken = write_run(tmp_path / "broken-s1-x", 1)
     text = (broken / results.CANDIDATES_FILE).read_text().splitlines()
     cells = text[4].split(",")
-    cells[7] = ""
+    cells[text[0].split(",").index(column)] = cell
     (broken / results.CANDIDATES_FILE).write_text("\n".join([*text[:4], ",".join(cells), *text[5:]]) + "\n")
-    with pytest.raises(LinkError, match=r"candidates.csv:5: range_m is missing"):
+    with pytest.raises(LinkError, match=rf"candidates.csv:5: {expected}"):
         read_candidates([broken])
+
+
+def test_every_feature_is_used_by_the_model_or_says_whether_there_is_telemetry():
+    assert {name for names in USED for name in names} == set(NAMES) - {NAMES[TELEMETRY]}
+
+
+def test_training_that_starts_from_a_model_keeps_it_where_the_runs_say_nothing_new(runs, tmp_path):
+    rows = read_candidates(runs)
+    first = train(rows, {})
+    again = train(rows, {}, start=first, strengths=[1e6])
+    assert [term.knots for term in again.terms] == [term.knots for term in first.terms]
+    features = rows.X[::40]
+    differences = [again.predict(x).log_odds - first.predict(x).log_odds for x in features]
+    assert np.abs(differences).max() < 0.05
+    moved = train(rows.take(rows.seed < 3), {}, start=first, strengths=[0.01])
+    assert np.abs([moved.predict(x).log_odds - first.predict(x).log_odds for x in features]).max() > 0.05
+
+
+def test_the_ablation_scores_a_model_without_each_group(runs, tmp_path):
+    file, held = tmp_path / "one.yaml", tmp_path / "held"
+    write_run(held / "village-20m-hover-parked-s8-detector", 8)
+    arguments = ["train-detector", *map(str, runs), "-o", str(file), "--ablation"]
+    refused = CliRunner().invoke(app, arguments)
+    assert refused.exit_code != 0
+    assert "--ablation needs --held-out" in refused.output
+    result = CliRunner().invoke(app, [*arguments, "--held-out", str(held)])
+    assert result.exit_code == 0, result.output
+    trained = yaml.safe_load(file.read_text())["stages"]["detect"]["config"]["model"]["trained"]
+    assert set(trained["ablation"]) == {"nothing", *GROUPS}
+    losses = {group: scores["with telemetry"][1] for group, scores in trained["ablation"].items()}
+    assert losses["size and shape"] == pytest.approx(losses["nothing"], rel=0.1)
+    assert losses["telemetry"] > 1.2 * losses["nothing"]  # the made runs differ by telemetry and top speed
+    assert "without 'motion', without telemetry: Brier" in result.output
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [("stages: {}", "not a weights file"), (None, "train it again"), ("- [", "not a weights file")],
+)
+def test_a_model_to_start_from_that_does_not_fit_is_refused(runs, tmp_path, text, expected):
+    file = tmp_path / "start.yaml"
+    if text is None:
+        made = train(read_candidates(runs), {}).model_dump(mode="json") | {"feature_version": 1}
+        text = yaml.safe_dump({"stages": {"detect": {"config": {"model": made}}}})
+    file.write_text(text)
+    arguments = ["train-detector", *map(str, runs), "-o", str(tmp_path / "one.yaml"), "--start", str(file)]
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code != 0
+    assert expected in " ".join(result.output.split())

@@ -12,6 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+import yaml
 from pydantic import ValidationError
 
 from flow.message import check_arrays
@@ -51,6 +52,7 @@ from tests.stages.caster import (
 from tests.stages.detect.test_candidate import candidate
 from tests.stages.made import ON_ITS_SIDE, START_NS
 
+TERM = {"alternative": 3, "feature": "range_m", "knots": (0.0, 1.0), "values": (0.0, -4.0)}
 PLACE_M = (0.0, 8.0, 10.0)  # 12.7 m away, 51 deg up
 WATCHING = dithering(half_rad=math.radians(1.0))  # as the aim stage does: a beam comes near in each rotor turn
 PASS_DEG = 4.5  # each swing completes a pass: a message every 0.4 s
@@ -440,6 +442,74 @@ def test_after_telemetry_ends_the_path_alone_decides():
     np.testing.assert_array_equal(spoke[0][-1].velocity_vehicle_mps, silent[0][-1].velocity_vehicle_mps)
 
 
+FLIES_ON = flying((-2.4, 8.0, 10.0), (1.0, 0.0, 0.4))
+OTHERS = flying((0.0, 0.0, 0.0), (-3.0, 2.0, -0.8))
+
+
+def followed(publish, seconds=5.0, **settings):
+    """(time [s], probability, reason) of the most probable candidate in each message, with this telemetry."""
+    candidates, _ = run([Drone(FLIES_ON)], seconds, publish=publish, **settings)
+    listed = [m for m in candidates if len(m.probability)]
+    return [((m.stamp_ns - START_NS) * 1e-9, float(m.probability[0]), m.reasons[0]) for m in listed]
+
+
+def switching(first, second, at_s):
+    """Telemetry of one trajectory and then of another, None: silence; the position is continuous."""
+
+    def publish(stage, t_s):
+        trajectory = first if t_s < at_s else second
+        if trajectory is None:
+            return
+        position = local_position(trajectory, t_s)
+        if first is not None and t_s >= at_s:
+            change_m = local_position(first, at_s).xyz_odom_m - local_position(second, at_s).xyz_odom_m
+            position = dataclasses.replace(position, xyz_odom_m=position.xyz_odom_m + change_m)
+        stage.on_drone_position(position)
+
+    return publish
+
+
+def test_telemetry_that_lies_mid_flight_makes_the_drone_improbable_within_seconds():
+    true, lies = followed(telemetry_of(FLIES_ON)), followed(switching(FLIES_ON, OTHERS, 2.0))
+    assert all(p > 0.95 for t, p, _ in true if t > 2.0)
+    assert all(p > 0.95 for t, p, _ in lies if 1.5 < t < 2.0)
+    after = [(p, reason) for t, p, reason in lies if t > 4.0]
+    assert after
+    assert all(p < 0.1 and "its path contradicts the drone's odometry" in reason for p, reason in after)
+
+
+def test_telemetry_that_starts_mid_flight_counts_within_seconds():
+    starts = followed(switching(None, FLIES_ON, 2.0))
+    assert not any("odometry" in reason for t, _, reason in starts if t < 2.0)
+    after = [(p, reason) for t, p, reason in starts if t > 3.5]
+    assert after
+    assert all("its path agrees with the drone's odometry" in reason for _, reason in after)
+    assert min(p for p, _ in after) > 0.95
+
+
+def test_the_trained_model_notices_telemetry_that_lies_mid_flight(request):
+    file = request.config.rootpath / "configs/models/detector.yaml"
+    model = yaml.safe_load(file.read_text())["stages"]["detect"]["config"]["model"]
+    lies = followed(switching(FLIES_ON, OTHERS, 2.0), model=model)
+    assert max(p for t, p, _ in lies if t < 2.0) > 0.9
+    after = [(p, reason) for t, p, reason in lies if t > 4.0]
+    assert all(p < 0.1 and "the drone's odometry" in reason for p, reason in after)
+
+
+def test_telemetry_of_another_drone_that_starts_mid_flight_is_noticed_within_seconds():
+    lies = followed(switching(None, OTHERS, 2.0))
+    after = [(p, reason) for t, p, reason in lies if t > 4.0]
+    assert all(p < 0.1 and "contradicts" in reason for p, reason in after) or not after
+
+
+def test_after_telemetry_stops_mid_flight_the_path_decides_within_seconds():
+    stops = followed(switching(FLIES_ON, None, 1.0))
+    assert any("agrees with the drone's odometry" in reason for t, _, reason in stops if t < 2.5)
+    after = [(p, reason) for t, p, reason in stops if t > 3.5]
+    assert after
+    assert not any("odometry" in reason for _, reason in after)
+
+
 def test_without_vehicle_motion_only_heights_are_compared():
     rising = flying((0.0, 0.0, 0.0), (0.0, 0.0, 1.5))
     passes_and_rises = Drone(flying((-2.0, 8.0, 8.0), (1.5, 0.0, 1.5)))
@@ -642,8 +712,7 @@ def test_the_same_pulses_give_the_same_messages():
 
 
 def test_a_trained_model_replaces_the_classifier():
-    term = {"alternative": 3, "feature": "range_m", "knots": (0.0, 1.0), "values": (0.0, -4.0)}
-    model = {"feature_version": VERSION, "priors": [(9.0, 9.0)] * 4, "terms": [term]}
+    model = {"feature_version": VERSION, "priors": [(9.0, 9.0)] * 4, "terms": [TERM]}
     _, accepted = run([hovering()], 1.5, model=model)
     assert accepted_after_s(accepted) < 1.0
     candidates, refused = run([hovering()], 1.5, model=model | {"priors": [(9.0, 9.0)] * 3 + [(2.0, 9.0)]})
@@ -689,6 +758,20 @@ def test_a_slice_without_pulses_is_ignored():
 def test_impossible_settings_are_rejected(settings):
     with pytest.raises(ValidationError):
         EvidenceDetect(**settings)
+
+
+@pytest.mark.parametrize(
+    ("model", "text"),
+    [
+        ({}, "feature_version"),
+        ({"feature_version": VERSION, "priors": [(1.0, 1.0)] * 4, "terms": []}, "terms"),
+        ({"feature_version": VERSION - 1, "priors": [(1.0, 1.0)] * 4, "terms": [TERM]}, "train it again"),
+        ({"feature_version": VERSION, "priors": [(math.nan, 1.0)] * 4, "terms": [TERM]}, "priors"),
+    ],
+)
+def test_a_model_that_was_not_trained_or_for_other_features_is_refused(model, text):
+    with pytest.raises(ValidationError, match=text):
+        EvidenceDetect(model=model)
 
 
 def test_a_trained_model_is_refused_for_another_lidar():

@@ -12,9 +12,9 @@ from stages.detect.candidate import Alternative
 from stages.detect.trained.features import NAMES, VERSION
 from stages.detect.trained.model import ALTERNATIVES, FAR_M, NEAR_M, DetectorModel, Prediction, reasons_of
 
-RANGE, SPEED = NAMES.index("range_m"), NAMES.index("speed_mps")
+RANGE, SPEED = NAMES.index("range_m"), NAMES.index("top_mps")
 FAR = {"alternative": 0, "feature": "range_m", "knots": (10.0, 20.0, 40.0), "values": (1.0, 0.0, -3.0)}
-FAST = {"alternative": 2, "feature": "speed_mps", "knots": (0.0, 10.0), "values": (0.0, -5.0), "missing": -1.0}
+FAST = {"alternative": 2, "feature": "top_mps", "knots": (0.0, 10.0), "values": (0.0, -5.0), "missing": -1.0}
 
 
 def model(*terms, **changed):
@@ -39,14 +39,14 @@ def test_a_term_is_linear_between_its_knots_and_constant_beyond():
 def test_a_missing_feature_adds_its_own_value():
     only = model(FAST, priors=[(99.0, 99.0), (99.0, 99.0), (0.0, 0.0), (99.0, 99.0)])
     assert log_odds(only) == pytest.approx(-1.0)
-    assert log_odds(only, speed_mps=5.0) == pytest.approx(-2.5)
+    assert log_odds(only, top_mps=5.0) == pytest.approx(-2.5)
 
 
 @pytest.mark.parametrize(("at", "expected"), [("near", (-5.0, -2.5, 0.0)), ("far", (0.0, -2.5, -5.0))])
 def test_a_term_near_or_far_counts_by_its_share_of_the_range(at, expected):
     only = model(FAST | {"at": at}, priors=[(99.0, 99.0), (99.0, 99.0), (0.0, 0.0), (99.0, 99.0)])
     ranges_m = (NEAR_M, (NEAR_M + FAR_M) / 2, FAR_M)
-    assert [log_odds(only, range_m=r, speed_mps=10.0) for r in ranges_m] == pytest.approx(expected)
+    assert [log_odds(only, range_m=r, top_mps=10.0) for r in ranges_m] == pytest.approx(expected)
 
 
 def test_a_drone_must_be_more_probable_than_all_alternatives_together():
@@ -63,7 +63,7 @@ def test_the_prior_depends_on_whether_there_is_telemetry():
 
 def test_contributions_are_weighted_by_the_probability_of_their_alternative():
     two = model(FAR, FAST, priors=[(0.0, 0.0), (99.0, 99.0), (0.0, 0.0), (99.0, 99.0)])
-    prediction = two.predict(features(range_m=40.0, speed_mps=10.0))
+    prediction = two.predict(features(range_m=40.0, top_mps=10.0))
     share = math.exp(5.0) / (math.exp(3.0) + math.exp(5.0))
     assert ALTERNATIVES[prediction.alternative] is Alternative.BIRD
     assert prediction.contributions[[RANGE, SPEED]] == pytest.approx([-3.0 * (1 - share), -5.0 * share])
@@ -74,7 +74,7 @@ def test_the_reasons_are_the_largest_contributions_with_their_values():
     contributions = np.zeros(len(NAMES))
     contributions[[RANGE, SPEED]] = 0.5, -2.0
     text = reasons_of(features(range_m=12.5), Prediction(-1.0, 2, contributions))
-    assert text == "speed over ground: not known (-2.0); range: 12.5 (+0.5); if not a drone: a bird"
+    assert text == "speed that it reaches, with its turn: not known (-2.0); range: 12.5 (+0.5); if not a drone: a bird"
 
 
 @pytest.mark.parametrize(

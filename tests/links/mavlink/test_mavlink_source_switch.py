@@ -356,6 +356,6 @@ def test_a_flight_is_switched_to_grd_and_back_to_gps_when_the_lidar_ends(tmp_pat
         pass
     assert simulation.flight is not None
     stack = simulation.flight.stack
-    events = [what for _, what in stack.events]
+    events = [str(event) for event in stack.events]
     assert events == ["plan: path", "source set 2", "source set 1"]
     assert not stack.quadrotor.crashed

@@ -26,7 +26,7 @@ from links.mavlink.transport.framing import parse_frame
 from links.recording import RecordingReader, decode_compressed_image
 from links.ros.mapping import BagMapping, TopicUse, read_mapping
 from links.vehicle_odometry.odometry import parse_pose
-from stages.messages import AutopilotStatus, DroneAttitude, DroneImu, DroneOdometry
+from stages.messages import AutopilotStatus, DroneAttitude, DroneGnss, DroneImu, DroneOdometry
 
 ROOT = Path(__file__).resolve().parents[3]
 OTHER = ROOT.parent / "shared" / "data" / "lidar_other"
@@ -429,8 +429,7 @@ def test_mavros_topics_become_frames_that_the_autopilots_decoder_reads(tmp_path:
     autopilot = Autopilot()
     messages = [m for r in records if (m := autopilot.decode(r)) is not None]
     newest = {type(m): m for m in messages}
-    assert set(newest) == {AutopilotStatus, DroneAttitude, DroneImu, DroneOdometry}
-    assert autopilot.counters["unused"] == 50  # GPS_RAW_INT
+    assert set(newest) == {AutopilotStatus, DroneAttitude, DroneGnss, DroneImu, DroneOdometry}
     assert_allclose(newest[DroneImu].acceleration_drone_mps2, [0.5, -0.4, 9.8], rtol=1e-6)
     assert_allclose(newest[DroneImu].angular_velocity_drone_radps, [0.1, 0.2, 0.3], rtol=1e-6)
     assert_allclose(newest[DroneAttitude].R_odom_drone, np.eye(3), atol=1e-6)  # x of odom is north

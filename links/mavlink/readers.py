@@ -6,6 +6,7 @@ ValueError for non-finite values.
 
 HIGHRES_IMU is not raw: PX4 subtracts the biases that EKF2 estimates (estimator_sensor_bias). They change within tens of
 seconds, and after the first sent pose they depend on it. The fusion estimates a bias of its own, which follows them.
+Its magnetic field is not read: less the bias that EKF2 fits to its yaw, it would bring a yaw that grd sent back.
 ArduPilot's RAW_IMU and SCALED_IMU hold the calibrated samples without the bias of its EKF.
 
 Source: https://mavlink.io/en/messages/common.html; PX4 src/modules/mavlink/streams/HIGHRES_IMU.hpp; ArduPilot
@@ -60,8 +61,6 @@ UNKNOWN_SENSOR, CUSTOM_ORIENTATION = 4, 100  # MAV_DISTANCE_SENSOR_UNKNOWN, MAV_
 # bits common to EKF_STATUS_FLAGS and ESTIMATOR_STATUS_FLAGS
 ATTITUDE, VELOCITY_HORIZONTAL, VELOCITY_VERTICAL, HORIZONTAL_RELATIVE = 1, 2, 4, 8
 HEIGHT, CONSTANT_POSITION = 32, 128
-
-MAGNETOMETER_UPDATED = 0b111 << 6  # HIGHRES_IMU_UPDATED_FLAGS
 
 
 def _vector(frame: Any, *names: str, unit: float = 1.0) -> NDArray[np.float64]:
@@ -122,26 +121,22 @@ def read_raw_imu(frame: Any, stamp_ns: int) -> DroneImu:
         stamp_ns=stamp_ns,
         acceleration_drone_mps2=_vector(frame, "xacc", "yacc", "zacc", unit=1e-3 * STANDARD_GRAVITY_MPS2),
         angular_velocity_drone_radps=_vector(frame, "xgyro", "ygyro", "zgyro", unit=1e-3),
-        magnetic_field_drone_ut=_magnetic_field(frame, 0.1),
+        magnetic_field_drone_ut=_magnetic_field(frame),
     )
 
 
 def read_highres_imu(frame: Any, stamp_ns: int) -> DroneImu:
-    """HIGHRES_IMU: m/s^2, rad/s and gauss."""
+    """HIGHRES_IMU: m/s^2 and rad/s. Its magnetic field is not read (see above)."""
     return DroneImu(
         stamp_ns=stamp_ns,
         acceleration_drone_mps2=_vector(frame, "xacc", "yacc", "zacc"),
         angular_velocity_drone_radps=_vector(frame, "xgyro", "ygyro", "zgyro"),
-        magnetic_field_drone_ut=_magnetic_field(frame, 100.0) if frame.fields_updated & MAGNETOMETER_UPDATED else None,
     )
 
 
-def _magnetic_field(frame: Any, unit_ut: float) -> NDArray[np.float64] | None:
-    """Field (3,) [uT] in drone axes; None: zero or not finite, no magnetometer."""
-    try:
-        field = _vector(frame, "xmag", "ymag", "zmag", unit=unit_ut)
-    except ValueError:
-        return None
+def _magnetic_field(frame: Any) -> NDArray[np.float64] | None:
+    """Field (3,) [uT] of a message in mgauss, drone axes; None: all zero, no magnetometer."""
+    field = _vector(frame, "xmag", "ymag", "zmag", unit=0.1)
     return field if field.any() else None
 
 

@@ -102,12 +102,12 @@ def drone_motion(message: DroneMotion, name: str, scene: ViewerScene) -> Entitie
     yield plot(f"{path}/force", message.specific_force_drone_mps2, [f"drone force {a} [m/s2]" for a in axes])
     rate_degps = np.degrees(message.angular_velocity_drone_radps)
     yield plot(f"{path}/rate", rate_degps, [f"drone rate {a} [deg/s]" for a in axes])
-    yield plot(f"{path}/force noise", message.specific_force_noise, [f"{a} [m/s2/sqrt(Hz)]" for a in axes])
+    yield plot(f"{path}/force_noise", message.specific_force_noise, [f"{a} [m/s2/sqrt(Hz)]" for a in axes])
     noise_degps = np.degrees(message.angular_velocity_noise)
-    yield plot(f"{path}/rate noise", noise_degps, [f"{a} [deg/s/sqrt(Hz)]" for a in axes])
+    yield plot(f"{path}/rate_noise", noise_degps, [f"{a} [deg/s/sqrt(Hz)]" for a in axes])
     if message.gyro_bias is not None:
         bias_degps = [math.degrees(message.gyro_bias.bias_radps)]
-        yield plot(f"{path}/gyro bias", bias_degps, ["about the vertical by the magnetic field [deg/s]"])
+        yield plot(f"{path}/gyro_bias", bias_degps, ["about the vertical by the magnetic field [deg/s]"])
     estimate = message.autopilot
     segments = [message.segment, math.nan if estimate is None else estimate.odom_segment]
     yield plot(f"{path}/segments", segments, ["IMU segment", "odom segment"])

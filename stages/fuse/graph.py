@@ -126,7 +126,7 @@ class InertialGraph:
 
     def add_vertical_gyro_bias(self, measured: GyroBias) -> None:
         """Add a measurement of the gyroscope's bias about the vertical."""
-        up = measured.up_drone / np.linalg.norm(measured.up_drone)
+        up = measured.up_drone
         covariance = ANY_BIAS**2 * np.eye(3) + (measured.sigma_radps**2 - ANY_BIAS**2) * np.outer(up, up)
         self.add_gyro_bias(measured.bias_radps * up, covariance)
 

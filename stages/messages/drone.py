@@ -160,7 +160,7 @@ class AutopilotMotion:
 class GyroBias:
     """Measured bias of the gyroscope about the vertical, up_drone . bias."""
 
-    up_drone: Vec3  # mean of the unit vectors up over the measurement
+    up_drone: Vec3  # unit vector up, mean over the measurement
     bias_radps: float
     sigma_radps: float
 

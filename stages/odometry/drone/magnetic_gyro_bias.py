@@ -53,10 +53,6 @@ class _SlopeVariance:
             self._count = min(self._count + 1.0, REMEMBERED)
             self.variance += (0.5 * (slope - last) ** 2 - self.variance) / self._count
 
-    def interrupt(self) -> None:
-        """The next slope does not follow the last one."""
-        self._last = None
-
 
 class MagneticGyroBias:
     """Call `add` for each IMU sample; it returns a measurement of the bias at the end of a window."""
@@ -98,19 +94,18 @@ class MagneticGyroBias:
         return self._close() if self._seconds >= WINDOW_S else None
 
     def _interrupt(self) -> None:
-        self._short.interrupt()
-        self._long.interrupt()
         self._slopes.clear()
         self.restart()
 
     def _close(self) -> GyroBias | None:
-        samples, seconds, up = np.array(self._samples), self._seconds, self._up / len(self._samples)
+        samples, seconds = np.array(self._samples), self._seconds
         if len(samples) < LEAST_SAMPLES or abs(self._turn_rad) > MOST_TURN_RAD:
             self._interrupt()
             return None
+        up = self._up / np.linalg.norm(self._up)
         self.restart()
         t = samples[:, 0] - samples[:, 0].mean()
-        slope = float(t @ np.unwrap(samples[:, 1]) / (t @ t))
+        slope = float(t @ samples[:, 1] / (t @ t))
         self._short.add(slope)
         self._slopes.append(slope)
         if len(self._slopes) == LONG:

@@ -376,8 +376,8 @@ def test_the_drones_motion_is_curves_of_force_rate_noise_and_segments():
     assert values == {
         f"{path}/force": [1.0, 2.0, 9.8],
         f"{path}/rate": pytest.approx([10.0, 20.0, 30.0]),
-        f"{path}/force noise": [0.07] * 3,
-        f"{path}/rate noise": pytest.approx([0.1] * 3),
-        f"{path}/gyro bias": [pytest.approx(0.2)],
+        f"{path}/force_noise": [0.07] * 3,
+        f"{path}/rate_noise": pytest.approx([0.1] * 3),
+        f"{path}/gyro_bias": [pytest.approx(0.2)],
         f"{path}/segments": [2, 4],
     }

@@ -46,7 +46,6 @@ MIN_OBSERVATION_NS = 5_000_000
 INITIAL_PASS_S = 0.05  # first estimate of the time to the rotor's next pass
 INNER_RAD = math.radians(8.0)  # beams with a larger elevation are used only when others need much more movement
 SWEEP_DEVIATION_RAD = math.radians(12.0)  # of an observation during the sweep; the fan is 30 deg wide
-OUTSIDE_RAD = math.radians(2.0)  # from the sector: the servo first moves to it
 FRESH_NS = 350_000_000  # a candidate with a return this recent may be observed during the sweep
 MAX_MISSED = 24  # missed observations that are remembered; older ones are obsolete, the drone moves
 HALF_DETECTION = 0.3  # of the span: a beam so far from its middle has half the detection probability
@@ -69,7 +68,6 @@ class _State:
     searching: bool = False  # for more drones, between observations of tracks
     search_until_ns: int = 0
     track_observations: int = 0  # since the last search segment
-    approach_rad: float | None = None  # end of the sector that the servo moves to
 
     @property
     def spacing_rad(self) -> float:
@@ -305,19 +303,11 @@ class BeamAim(Stage[BeamAimSettings]):
     def _sweep(self, servo: ServoState) -> ServoGoal | None:
         state, limit_radps = self._state, self.settings.limit_rpm * RPM_RADPS
         if not state.searching:
-            low_rad, high_rad = state.sector.limits(servo.stamp_ns, state.sweep.passes)
-            state.sweep.limit(low_rad, high_rad)
-            nearest_rad = min(max(servo.position_rad, low_rad), high_rad)
-            is_sector = (low_rad, high_rad) != self._travel_rad
-            if is_sector and abs(servo.position_rad - nearest_rad) > OUTSIDE_RAD:
-                if state.approach_rad == nearest_rad:
-                    return None
-                state.approach_rad = nearest_rad
-                state.sweep.stop()
-                return ServoGoal(stamp_ns=servo.stamp_ns, position_rad=nearest_rad, speed_radps=limit_radps)
-        state.approach_rad = None
+            state.sweep.limit(*state.sector.limits(servo.stamp_ns, state.sweep.passes))
+        is_sector = (state.sweep.low_rad, state.sweep.high_rad) != self._travel_rad
         resume_radps = limit_radps if state.searching else None
-        goal = self._state.sweep.goal(servo.stamp_ns, servo.position_rad, self._search_radps(), resume_radps)
+        approach_radps = limit_radps if is_sector else None
+        goal = state.sweep.goal(servo.stamp_ns, servo.position_rad, self._search_radps(), resume_radps, approach_radps)
         if goal is None:
             return None
         return ServoGoal(stamp_ns=servo.stamp_ns, position_rad=goal[0], speed_radps=goal[1])

@@ -12,6 +12,7 @@ GOAL_TOLERANCE_RAD = math.radians(0.6)
 STALL_NS = 300_000_000  # a servo that comes no nearer to its goal for this long counts as arrived
 END_TOLERANCE_RAD = math.radians(2.0)  # from an end of the travel this near, the sweep starts away from it
 RESUME_TOLERANCE_RAD = math.radians(1.0)
+OUTSIDE_RAD = math.radians(2.0)  # from the limits: the servo first moves to the nearer one
 
 
 @dataclass(slots=True, eq=False)
@@ -25,6 +26,7 @@ class SweepTrajectory:
     nominal_rad: float | None = None  # position of the sweep during observations that do not interrupt it
     resume_rad: float | None = None  # where the last search segment between observations of tracks ended
     passes: int = 0  # completed, from one end to the other
+    _approaches: bool = False  # the goal is a limit, approached from outside of both
     _min_distance_rad: float = math.inf  # to the goal, since the goal was set
     _min_distance_ns: int = 0  # when that minimum last decreased
 
@@ -48,11 +50,18 @@ class SweepTrajectory:
         return self.nominal_rad
 
     def goal(
-        self, stamp_ns: int, position_rad: float, speed_radps: float, resume_radps: float | None
+        self,
+        stamp_ns: int,
+        position_rad: float,
+        speed_radps: float,
+        resume_radps: float | None,
+        approach_radps: float | None = None,
     ) -> tuple[float, float] | None:
         """A new goal [rad] and speed [rad/s], or None while the last goal holds.
 
-        With `resume_radps` the servo first returns to `resume_rad` at that speed.
+        With `resume_radps` the servo first returns to `resume_rad` at that speed. With `approach_radps` it first moves
+        at that speed to the nearer limit, from outside of both. An approach that stalls counts as a pass and is
+        repeated.
         """
         self.nominal_rad = None
         if resume_radps is not None and self.resume_rad is not None:
@@ -65,16 +74,24 @@ class SweepTrajectory:
         distance_rad = math.inf if self.goal_rad is None else abs(self.goal_rad - position_rad)
         if distance_rad < self._min_distance_rad:
             self._min_distance_rad, self._min_distance_ns = distance_rad, stamp_ns
-        arrived = distance_rad < GOAL_TOLERANCE_RAD or stamp_ns - self._min_distance_ns > STALL_NS
+        stalled = stamp_ns - self._min_distance_ns > STALL_NS
+        near_rad = OUTSIDE_RAD if self._approaches else GOAL_TOLERANCE_RAD
         if self.goal_rad is not None:
-            if not arrived:
+            if distance_rad >= near_rad and not stalled:
                 return None
-            self.increasing = not self.increasing
-            self.passes += 1
+            if not self._approaches:
+                self.increasing = not self.increasing
+            if not self._approaches or distance_rad >= near_rad:
+                self.passes += 1
+        nearest_rad = min(max(position_rad, self.low_rad), self.high_rad)
+        self._approaches = approach_radps is not None and abs(position_rad - nearest_rad) > OUTSIDE_RAD
+        self._min_distance_rad, self._min_distance_ns = math.inf, stamp_ns
+        if approach_radps is not None and self._approaches:
+            self.goal_rad = nearest_rad
+            return nearest_rad, approach_radps
         if self.low_rad + END_TOLERANCE_RAD > position_rad:
             self.increasing = True
         elif self.high_rad - END_TOLERANCE_RAD < position_rad:
             self.increasing = False
         self.goal_rad = self.high_rad if self.increasing else self.low_rad
-        self._min_distance_rad, self._min_distance_ns = math.inf, stamp_ns
         return self.goal_rad, speed_radps

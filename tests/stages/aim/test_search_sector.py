@@ -10,8 +10,8 @@ import pytest
 from stages.aim import BeamAim
 from stages.aim.search_sector import SECTOR_PASSES, WHOLE_PASSES, SearchSector, sector_rad
 from stages.messages import CueState
-from tests.stages.aim.test_beam_aim import fly
-from tests.stages.made import ON_ITS_SIDE, START_NS
+from tests.stages.aim.test_beam_aim import candidates, fly, towards
+from tests.stages.made import MS, ON_ITS_SIDE, START_NS, servo
 
 TRAVEL_RAD = (0.0, math.pi)
 FAR_M = np.array([-20.0, 20.0, 15.0])  # at 135 deg
@@ -87,3 +87,26 @@ def test_a_cue_that_is_no_longer_trusted_frees_the_sweep():
     flight = fly(BeamAim(mount=ON_ITS_SIDE), 2.5, publish)
     assert {0.0, round(math.pi, 3)} & set(flight.ends_reached())
     assert flight.goals[-1][1].position_rad in (0.0, pytest.approx(math.pi))
+
+
+def test_a_candidate_during_the_approach_of_the_sector_does_not_end_the_search():
+    def publish(aim: BeamAim, t_s: float) -> None:
+        aim.on_cue(cue_state(t_s))
+        if 0.05 <= t_s < 0.4:
+            aim.on_candidates(candidates(towards(20.0, 30.0)(np.array([0.0]))[0], t_s, 0.6))
+
+    flight = fly(BeamAim(mount=ON_ITS_SIDE), 5.0, publish)
+    low, high = sector_rad(ON_ITS_SIDE, TRAVEL_RAD, FAR_M, P_M2) or (0.0, 0.0)
+    after = [goal.position_rad for t_s, goal in flight.goals if t_s > 1.5]
+    assert {round(low, 3), round(high, 3)} <= {round(goal, 3) for goal in after}
+
+
+def test_a_lost_goal_is_sent_again_and_a_servo_that_never_reaches_the_sector_searches_elsewhere():
+    aim, goals = BeamAim(mount=ON_ITS_SIDE), []
+    for tick in range(600):
+        aim.on_cue(cue_state(0.005 * tick))
+        if (goal := aim.on_servo(servo(START_NS + 5 * tick * MS, 0.3))) is not None:
+            goals.append(round(goal.position_rad, 3))
+    low, _ = sector_rad(ON_ITS_SIDE, TRAVEL_RAD, FAR_M, P_M2) or (0.0, 0.0)
+    assert goals[:2] == [round(low, 3)] * 2
+    assert {0.0, round(math.pi, 3)} <= set(goals)

@@ -141,9 +141,9 @@ class BeamAim(Stage[BeamAimSettings]):
     def on_cue(self, cue: CueState) -> None:
         """Update the sector to search, by a cue that gives a position and is trusted."""
         if cue.xyz_vehicle_m is not None and cue.covariance_m2 is not None:
-            self._state.sector.update(cue.stamp_ns, cue.xyz_vehicle_m, cue.covariance_m2)
+            self._state.sector.update(cue.source, cue.stamp_ns, cue.xyz_vehicle_m, cue.covariance_m2)
         elif not cue.trusted:
-            self._state.sector.withdraw()
+            self._state.sector.withdraw(cue.source)
 
     def on_servo(self, servo: ServoState) -> ServoGoal | None:
         """A new goal at the end of the planned observation, or at once when the target changes; else None."""

@@ -36,18 +36,20 @@ class SearchSector:
 
     mount: LidarMount
     travel_rad: tuple[float, float]
+    _source: str = ""  # of the newest cue
     _cue: tuple[int, Array64, Array64] | None = None  # stamp, position and covariance, frame vehicle
     _limits: tuple[float, float] | None = None
     _whole: bool = False
     _since_pass: int = 0
 
-    def update(self, stamp_ns: int, xyz_vehicle_m: Array64, covariance_m2: Array64) -> None:
+    def update(self, source: str, stamp_ns: int, xyz_vehicle_m: Array64, covariance_m2: Array64) -> None:
         """Newest position of the drone by a cue."""
-        self._cue = stamp_ns, xyz_vehicle_m, covariance_m2
+        self._source, self._cue = source, (stamp_ns, xyz_vehicle_m, covariance_m2)
 
-    def withdraw(self) -> None:
-        """The cue is not trusted."""
-        self._cue = None
+    def withdraw(self, source: str) -> None:
+        """The cue of this source is not trusted."""
+        if source == self._source:
+            self._cue = None
 
     def limits(self, stamp_ns: int, passes: int) -> tuple[float, float]:
         """Servo positions [rad] to sweep between after so many passes of the sweep."""

@@ -10,7 +10,7 @@ import pytest
 from stages.aim import BeamAim
 from stages.aim.search_sector import SECTOR_PASSES, WHOLE_PASSES, SearchSector, sector_rad
 from stages.messages import CueState
-from tests.stages.aim.test_beam_aim import candidates, fly, towards
+from tests.stages.aim.test_beam_aim import candidates, fly, towards, tracking
 from tests.stages.made import MS, ON_ITS_SIDE, START_NS, servo
 
 TRAVEL_RAD = (0.0, math.pi)
@@ -39,7 +39,7 @@ def test_a_more_precise_cue_gives_a_narrower_sector_and_one_overhead_none():
 
 def test_the_whole_travel_follows_some_passes_of_the_sector():
     sector = SearchSector(ON_ITS_SIDE, TRAVEL_RAD)
-    sector.update(START_NS, FAR_M, P_M2)
+    sector.update("gnss", START_NS, FAR_M, P_M2)
     whole = [sector.limits(START_NS, passes) == TRAVEL_RAD for passes in range(2 * (SECTOR_PASSES + WHOLE_PASSES))]
     assert whole == 2 * (SECTOR_PASSES * [False] + WHOLE_PASSES * [True])
 
@@ -47,17 +47,17 @@ def test_the_whole_travel_follows_some_passes_of_the_sector():
 def test_without_a_recent_or_trusted_cue_the_whole_travel_is_searched():
     sector = SearchSector(ON_ITS_SIDE, TRAVEL_RAD)
     assert sector.limits(START_NS, 0) == TRAVEL_RAD
-    sector.update(START_NS, FAR_M, P_M2)
+    sector.update("gnss", START_NS, FAR_M, P_M2)
     assert sector.limits(START_NS + 2_000_000_000, 0) == TRAVEL_RAD
-    sector.update(START_NS, FAR_M, P_M2)
-    sector.withdraw()
+    sector.update("gnss", START_NS, FAR_M, P_M2)
+    sector.withdraw("gnss")
     assert sector.limits(START_NS, 0) == TRAVEL_RAD
 
 
-def cue_state(t_s: float, xyz_m=FAR_M, trusted: bool = True) -> CueState:
+def cue_state(t_s: float, xyz_m=FAR_M, trusted: bool = True, source: str = "gnss") -> CueState:
     return CueState(
         stamp_ns=START_NS + round(1e9 * t_s),
-        source="gnss",
+        source=source,
         trusted=trusted,
         reason="made",
         bias_m=np.zeros(3),
@@ -110,3 +110,25 @@ def test_a_lost_goal_is_sent_again_and_a_servo_that_never_reaches_the_sector_sea
     low, _ = sector_rad(ON_ITS_SIDE, TRAVEL_RAD, FAR_M, P_M2) or (0.0, 0.0)
     assert goals[:2] == [round(low, 3)] * 2
     assert {0.0, round(math.pi, 3)} <= set(goals)
+
+
+def test_a_cue_of_another_source_that_is_not_trusted_does_not_withdraw_the_sector():
+    def publish(aim: BeamAim, t_s: float) -> None:
+        aim.on_cue(cue_state(t_s))
+        aim.on_cue(cue_state(t_s, trusted=False, source="uwb"))
+
+    flight = fly(BeamAim(mount=ON_ITS_SIDE), 1.5, publish)
+    low, high = sector_rad(ON_ITS_SIDE, TRAVEL_RAD, FAR_M, P_M2) or (0.0, 0.0)
+    assert flight.ends_reached()[:2] == pytest.approx([low, high], abs=2e-3)
+
+
+def test_the_second_drone_is_searched_on_the_whole_travel():
+    track = tracking(towards(135.0, 30.0))
+
+    def publish(aim: BeamAim, t_s: float) -> None:
+        aim.on_cue(cue_state(t_s))
+        if t_s > 1.0:
+            track(aim, t_s)
+
+    flight = fly(BeamAim(mount=ON_ITS_SIDE, max_drones=2), 6.0, publish)
+    assert np.degrees(np.ptp(flight.servo_rad[300:])) > 90.0

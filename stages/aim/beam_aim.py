@@ -302,7 +302,9 @@ class BeamAim(Stage[BeamAimSettings]):
 
     def _sweep(self, servo: ServoState) -> ServoGoal | None:
         state, limit_radps = self._state, self.settings.limit_rpm * RPM_RADPS
-        if not state.searching:
+        if state.searching:  # the sector is that of a drone that has a track
+            state.sweep.limit(*self._travel_rad)
+        else:
             state.sweep.limit(*state.sector.limits(servo.stamp_ns, state.sweep.passes))
         is_sector = (state.sweep.low_rad, state.sweep.high_rad) != self._travel_rad
         resume_radps = limit_radps if state.searching else None

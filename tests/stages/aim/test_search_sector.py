@@ -127,7 +127,7 @@ def test_the_second_drone_is_searched_on_the_whole_travel():
 
     def publish(aim: BeamAim, t_s: float) -> None:
         aim.on_cue(cue_state(t_s))
-        if t_s > 1.0:
+        if t_s > 0.6:  # during the first passes of the sector
             track(aim, t_s)
 
     flight = fly(BeamAim(mount=ON_ITS_SIDE, max_drones=2), 6.0, publish)

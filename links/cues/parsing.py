@@ -131,7 +131,7 @@ def _number(values: Any, name: str, low: float, high: float) -> float:
     value = values.get(name) if isinstance(values, dict) else None
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise ValueError(f"no number '{name}'")
-    return _within(float(value), low, high)
+    return float(_within(value, low, high))  # an integer may be too large for a float
 
 
 def _optional(values: Any, name: str, low: float, high: float) -> float | None:

@@ -84,6 +84,7 @@ def test_nmea_without_a_fix_and_other_sentences_are_no_cue():
         ({"vehicle_gnss": PLACE | {"heading_deg": "80"}}, "heading_deg"),
         (b'{"uwb_range": {"range_m": NaN}}', "out of its range"),
         (b'{"uwb_range": {"range_m": 1e999}}', "out of its range"),
+        (b'{"uwb_range": {"range_m": 1' + 400 * b"0" + b"}}", "out of its range"),
         ({"uwb_range": {"range_m": True}}, "range_m"),
         ({"uwb_range": {"range_m": 2000}}, "out of its range"),
         (GGA.replace(b"545.4", b"545.5"), "checksum"),

@@ -50,6 +50,8 @@ _DRONE = re.compile(r"drone|uav|copter|quad|down|mavros", re.I)
 _VEHICLE = re.compile(r"vehicle|ugv|car|rover|husky|up(?![a-z])|roof", re.I)
 _SERVO = re.compile(r"servo|turntable|dynamixel|pan|joint", re.I)
 _GLOBAL = re.compile(r"global_position")  # of mavros: by GNSS, not the pose that the autopilot flies with
+_RECEIVER = re.compile(r"mavros/(.*/)?raw/")  # of mavros: the GNSS receiver's own position
+_ESTIMATE = re.compile(r"global_position/global$")  # of mavros: the estimator's position, which may be a sent pose
 _NOT_PACKETS = re.compile(r"imu", re.I)
 
 
@@ -117,6 +119,11 @@ def checked(mapping: BagMapping, topics: Iterable[BagTopic], source: str) -> dic
                     f"{source}: {stream} cannot be made of {use.topic}, type {kind}: "
                     f"it takes {', '.join(TYPES[stream])}"
                 )
+            if kind == GNSS and _ESTIMATE.search(use.topic):
+                raise LinkError(
+                    f"{source}: {use.topic} is the position of the autopilot's estimator, which may contain poses that "
+                    f"grd sent: use the receiver's, {_ESTIMATE.sub('global_position/raw/fix', use.topic)}"
+                )
             if use.topic in by_topic:
                 raise LinkError(f"{source}: {use.topic} is named for {by_topic[use.topic][0]} and for {stream}")
             by_topic[use.topic] = stream, use
@@ -145,6 +152,7 @@ def _named(stream: str, fits: list[BagTopic]) -> list[BagTopic]:
         frames = [topic for topic in fits if topic.type == MAVLINK and not topic.name.endswith("/to")][:1]
         drone = [topic for topic in fits if topic.type != MAVLINK and _DRONE.search(topic.name)]
         drone = [topic for topic in drone if topic.type != POSE or not _GLOBAL.search(topic.name)]
+        drone = [topic for topic in drone if topic.type != GNSS or _RECEIVER.search(topic.name)]
         return frames or [topic for topic in drone if topic == next(t for t in drone if t.type == topic.type)]
     if stream == DRONE_CAMERA:
         return [topic for topic in fits if _DRONE.search(topic.name)][:1]

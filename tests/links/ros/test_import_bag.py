@@ -444,8 +444,9 @@ def test_damaged_values_of_mavros_are_counted_and_the_rest_is_imported(tmp_path:
     good = {"orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}}
     values = [("imu", {**good, "angular_velocity": {"x": 1e300, "y": 0.0, "z": 0.0}}), ("imu", good)]
     values += [("fix", {"latitude": 1e10, "longitude": 139.7}), ("fix", {"latitude": 35.7, "longitude": 139.7})]
+    names = {"imu": "/mavros/imu/data", "fix": "/mavros/global_position/raw/fix"}
     entries: list[Entry] = [
-        (f"/mavros/{name}", kinds[name], START_NS + k * 10**7, {"header": header(START_NS + k * 10**7), **each})
+        (names[name], kinds[name], START_NS + k * 10**7, {"header": header(START_NS + k * 10**7), **each})
         for k, (name, each) in enumerate(values)
     ]
     report, records, _ = imported(tmp_path, write_bag(tmp_path / "bag", entries))
@@ -470,6 +471,7 @@ def test_the_guess_takes_what_names_and_types_say(tmp_path: Path):
         "/mavros/local_position/odom": "nav_msgs/msg/Odometry",
         "/imu/data": imu,  # the vehicle's own
         "/mavros/imu/data": imu,
+        "/mavros/global_position/global": fix,  # the estimator's, which may be a sent pose
         "/mavros/global_position/raw/fix": fix,
         "/fix": fix,
         "/rosout": "std_msgs/msg/String",
@@ -490,6 +492,17 @@ def test_the_guess_takes_what_names_and_types_say(tmp_path: Path):
             "/mavros/local_position/odom",
         ],
     }
+
+
+def test_the_estimators_global_position_is_not_the_receivers(tmp_path: Path):
+    topic = "/mavros/global_position/global"
+    entries: list[Entry] = [(topic, "sensor_msgs/msg/NavSatFix", START_NS, {})]
+    bag = write_bag(tmp_path / "bag", entries)
+    info = file_info(bag)
+    assert info.mapping is not None
+    assert info.mapping.uses == {}
+    assert "estimator" in (text := refused(bag, tmp_path, mapping=mapping(autopilot_rx={"topic": topic})))
+    assert "/mavros/global_position/raw/fix" in text
 
 
 def test_info_writes_the_guess_and_import_takes_it(tmp_path: Path):

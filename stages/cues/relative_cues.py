@@ -3,9 +3,10 @@
     gnss       drone and vehicle: the difference of two positions, turned to map by the yaw of north (map_north.py);
                without that yaw only its horizontal length and its height
     uwb        distance
-    altitude   the autopilot's altitude above home (barometer), from the height of the take-off point
+    altitude   altitude above home by the autopilot's estimator (barometer), from the height of the take-off point
 
-Each has a latency (the measurement was true so long before its stamp), noise, and a bias that changes slowly. The bias
+A receiver's position and a range have a latency (the measurement was true so long before its stamp); the autopilot's
+estimate is that at its stamp. Each has noise, and a bias that changes slowly. The bias
 of GNSS is that of one receiver; those of drone and vehicle add up. The autopilot's estimate is used only while it
 cannot contain a pose that grd sent (`IndependentTelemetry`); a receiver's own position never contains one.
 
@@ -64,9 +65,11 @@ class UwbSettings(_CueSettings):
 
 
 class AltitudeSettings(_CueSettings):
-    """Errors of the barometric altitude, one sigma, and the height of the take-off point."""
+    """Errors of the altitude above home by the autopilot's estimator, one sigma, and the height of the take-off point.
 
-    latency_s: float = Field(default=0.1, ge=0, le=2)
+    Without GNSS height its slow error is that of the barometer.
+    """
+
     noise_m: float = Field(default=0.3, gt=0)
     bias_m: float = Field(default=1.5, ge=0)  # 0.18 hPa of weather, temperature and rotor wash since the take-off
     home_up_m: float | None = Field(
@@ -128,7 +131,8 @@ class RelativeCues(Stage[RelativeCuesSettings]):
         """Position of the drone by its receiver."""
         self._receiver_ns = gnss.stamp_ns
         here = Geographic(gnss.latitude_rad, gnss.longitude_rad, gnss.altitude_m)
-        return self._gnss_cue(gnss.stamp_ns, here, gnss.sigma_m, gnss.sigma_up_m)
+        latency_s = 0.0 if self.settings.gnss is None else self.settings.gnss.latency_s
+        return self._gnss_cue(gnss.stamp_ns - round(1e9 * latency_s), here, gnss.sigma_m, gnss.sigma_up_m)
 
     def on_global_position(self, position: DroneGlobalPosition) -> list[DroneCue]:
         """Position by the autopilot, in place of its receiver's, and its altitude above home."""
@@ -162,10 +166,9 @@ class RelativeCues(Stage[RelativeCuesSettings]):
         settings = self.settings.altitude
         if settings is None or settings.home_up_m is None:
             return None
-        stamp_ns = position.stamp_ns - round(1e9 * settings.latency_s)
-        up_m = position.altitude_above_home_m + settings.home_up_m - float(self._trail.at(stamp_ns)[1][2])
+        up_m = position.altitude_above_home_m + settings.home_up_m - float(self._trail.at(position.stamp_ns)[1][2])
         return DroneCue(
-            stamp_ns=stamp_ns,
+            stamp_ns=position.stamp_ns,
             source="altitude",
             kind=CueKind.HEIGHT,
             value_m=np.array([up_m]),
@@ -175,13 +178,12 @@ class RelativeCues(Stage[RelativeCuesSettings]):
         )
 
     def _gnss_cue(
-        self, arrival_ns: int, drone: Geographic, sigma_m: float | None, sigma_up_m: float | None
+        self, stamp_ns: int, drone: Geographic, sigma_m: float | None, sigma_up_m: float | None
     ) -> DroneCue | None:
         """The difference of both positions, at the time of the drone's."""
         settings, vehicle = self.settings.gnss, self._vehicle
         if settings is None:
             return None
-        stamp_ns = arrival_ns - round(1e9 * settings.latency_s)
         if vehicle is None or abs(stamp_ns - vehicle[0]) > MAX_AGE_NS:
             self._not_used["GNSS of the drone without one of the vehicle"] += 1
             return None

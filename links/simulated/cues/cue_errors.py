@@ -59,9 +59,8 @@ class RangingSettings(_Settings):
 
 
 class BarometerSettings(_Settings):
-    """The drone's altitude above home, which is the road at the vehicle's start."""
+    """The drone's altitude above home by its autopilot's estimator, which is the road at the vehicle's start."""
 
-    latency_s: float = Field(default=0.1, ge=0, le=2)
     drift_m: float = Field(default=1.0, ge=0, le=100)
     drift_time_s: float = Field(default=120.0, gt=1)
     noise_m: float = Field(default=0.1, ge=0, le=100)

@@ -68,14 +68,15 @@ class DroneReceiver:
             mavlink.MAVLink_gps_raw_int_message(
                 ns // 1000, FIX_3D, lat, lon, alt, UNKNOWN, UNKNOWN, UNKNOWN, UNKNOWN, SATELLITES
             )
-            for ns, (lat, lon, alt) in zip(device_ns.tolist(), self._scaled(time_s), strict=True)
+            for ns, (lat, lon, alt) in zip(
+                device_ns.tolist(), self._scaled(time_s - self.settings.latency_s), strict=True
+            )
         ]
 
     def global_positions(self, time_s: Array64, device_ns: NDArray[np.int64]) -> list[Any]:
-        """GLOBAL_POSITION_INT, sent at times (n,): the receiver's position, the barometer's height above home."""
+        """GLOBAL_POSITION_INT, sent at times (n,): the estimate at that time, with the errors of GNSS and barometer."""
         height = self.barometer or BarometerSettings()
-        measured_s = np.maximum(time_s - height.latency_s, 0.0)
-        up_m = self._own(measured_s)[:, 2] + self._height_error.at(measured_s)[:, 0] - self._home_up_m + height.offset_m
+        up_m = self._own(time_s)[:, 2] + self._height_error.at(time_s)[:, 0] - self._home_up_m + height.offset_m
         return [
             mavlink.MAVLink_global_position_int_message(
                 ns // 1_000_000, lat, lon, alt, round(1e3 * up), 0, 0, 0, UNKNOWN
@@ -84,8 +85,8 @@ class DroneReceiver:
         ]
 
     def _scaled(self, time_s: Array64) -> list[tuple[int, int, int]]:
-        """Latitude, longitude [1e-7 deg] and altitude [mm] of messages sent at times (n,)."""
-        measured_s = np.maximum(time_s - self.settings.latency_s, 0.0)
+        """Latitude, longitude [1e-7 deg] and altitude [mm], measured at times (n,)."""
+        measured_s = np.maximum(time_s, 0.0)
         xyz_m = self._drone(measured_s) + self._error.at(measured_s) + np.array(self.settings.offset_world_m)
         return [
             (

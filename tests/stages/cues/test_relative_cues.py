@@ -139,6 +139,20 @@ def test_the_autopilots_position_replaces_a_silent_receiver_and_never_after_a_se
     assert stage.on_global_position(echo) == []
 
 
+def test_the_autopilots_position_is_its_estimate_at_its_stamp():
+    position = DroneGlobalPosition(
+        stamp_ns=at(0.4), **place((12.0, 0.0, 9.0))._asdict(), altitude_above_home_m=10.0, independent=True
+    )
+    stage = RelativeCues(altitude={"home_up_m": 0.0})
+    for t_s in (0.0, 0.4):
+        stage.on_motion(motion(t_s, (10.0 * t_s, 0.0, 5.0 * t_s)))
+    stage.on_vehicle_gnss(vehicle(0.0))
+    altitude, gnss = stage.on_global_position(position)
+    assert (altitude.stamp_ns, gnss.stamp_ns) == (at(0.4), at(0.4))
+    assert altitude.value_m == pytest.approx([8.0])  # the vehicle has risen by 2 m
+    assert gnss.value_m == pytest.approx([8.0, 0.0, 7.0], abs=0.01)
+
+
 def test_a_range_is_measured_from_the_device_on_the_turned_vehicle():
     stage = RelativeCues(uwb={"anchor_vehicle_m": (1.0, 0.0, 0.5)})
     stage.on_motion(motion(0.0, (5.0, 5.0, 0.0), yaw_rad=math.pi / 2))

@@ -74,14 +74,15 @@ def test_the_heading_is_that_of_the_vehicle_from_east():
     assert np.cos(first.yaw_enu_rad - expected) == pytest.approx(1.0, abs=1e-6)
 
 
-def test_the_barometer_reports_the_height_above_the_road():
+def test_the_autopilots_estimate_is_the_position_and_the_height_above_the_road_now():
     cues = {"drone": EXACT, "barometer": {"drift_m": 0.0, "noise_m": 0.0}}
     simulation, found = messages_of(cues)
     positions = [m for m in found if isinstance(m, DroneGlobalPosition)]
     assert len(positions) > 10
     up_m = simulation.scenario.vehicle.camera_height_m
     for position in positions[2:]:
-        drone_m, _ = true_m(simulation, position.stamp_ns, 0.1)
+        drone_m, _ = true_m(simulation, position.stamp_ns, 0.0)
+        assert world_m(position) == pytest.approx(drone_m, abs=0.06)
         assert position.altitude_above_home_m == pytest.approx(drone_m[2] + up_m, abs=0.05)
 
 

@@ -120,9 +120,9 @@ class RelativeCues(Stage[RelativeCuesSettings]):
         self._origin = self._origin or here
         self._vehicle = stamp_ns, here, gnss
         R, _ = self._trail.at(stamp_ns)
-        if gnss.yaw_enu_rad is not None:
+        if gnss.yaw_enu_rad is not None and (self._trail.known_at(stamp_ns) or not self._trail.known):
             sigma = gnss.yaw_sigma_rad or math.radians(settings.heading_sigma_deg)
-            self._north.add_heading(heading_rad(R), gnss.yaw_enu_rad, sigma)
+            self._north.add_heading(stamp_ns, heading_rad(R), gnss.yaw_enu_rad, sigma)
         if self._trail.known_at(stamp_ns):
             antenna_m = self._on_vehicle_m(stamp_ns, settings.antenna_vehicle_m)
             self._north.add_position(stamp_ns, antenna_m[:2], displacement_enu_m(self._origin, here)[:2])
@@ -197,7 +197,7 @@ class RelativeCues(Stage[RelativeCuesSettings]):
             max(settings.bias_up_m, sigma_up_m or 0.0) ** 2 + max(settings.bias_up_m, report.sigma_up_m or 0.0) ** 2
         )
         noise_m2, noise_up_m2 = 2.0 * settings.noise_m**2, 2.0 * settings.noise_up_m**2
-        north = self._north.yaw
+        north = self._north.yaw(stamp_ns)
         start_m = self._on_vehicle_m(vehicle_ns, settings.antenna_vehicle_m)
         moved_m = start_m - self._trail.at(stamp_ns)[1]
         if north is None or north[1] > MAX_YAW_SIGMA_RAD:

@@ -115,6 +115,15 @@ def test_the_vehicles_motion_between_both_measurements_counts():
     assert cue.value_m == pytest.approx([8.0, 0.0, 9.0], abs=0.01)
 
 
+def test_a_heading_is_not_used_while_the_vehicles_motion_is_unknown():
+    stage = RelativeCues()
+    stage.on_motion(motion(0.0, (0.0, 0.0, 0.0)))
+    stage.on_vehicle_gnss(vehicle(1.0))  # 1 s after the last pose: the vehicle may have turned
+    cue = stage.on_gnss(drone(1.0, (12.0, -5.0, 9.0)))
+    assert cue is not None
+    assert cue.kind is CueKind.LEVEL_AND_HEIGHT
+
+
 def test_gnss_that_is_too_old_or_of_another_place_is_not_used():
     stage = RelativeCues()
     assert stage.on_gnss(drone(0.0, (1.0, 2.0, 3.0))) is None

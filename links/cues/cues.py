@@ -23,6 +23,7 @@ from links.vehicle_odometry.udp import listen_udp
 from stages.messages import DroneGnss, UwbRange, VehicleGnss
 
 NMEA_SUFFIX = "/nmea"  # topic of NMEA datagrams: a recording declares one encoding per topic
+MAX_REASONS = 20  # of rejections, counted each
 
 
 class CuesSettings(SourceSettings):
@@ -41,7 +42,7 @@ class CuesSettings(SourceSettings):
 
 
 class Cues(Source[CuesSettings]):
-    """GNSS of the vehicle and of the drone, ranges. A datagram without a valid cue is counted and skipped."""
+    """GNSS of the vehicle and of the drone, ranges. What is invalid is counted with its reason and skipped."""
 
     def __init__(self, settings: CuesSettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
@@ -71,16 +72,15 @@ class Cues(Source[CuesSettings]):
             yield (_on_its_topic(record) for record in records)
 
     def decode(self, record: Record) -> Iterator[VehicleGnss | DroneGnss | UwbRange]:
-        """The cues of one datagram; none of an invalid one."""
-        try:
-            found = self._parser.parse(record.stamp_ns, record.data)
-        except ValueError as error:
-            self._rejected[str(error)] += 1
-            return
+        """The valid cues of one datagram."""
+        found, rejected = self._parser.parse(record.stamp_ns, record.data)
+        for reason in rejected:  # it may quote what was sent: the number of different ones is limited
+            known = reason in self._rejected or len(self._rejected) < MAX_REASONS
+            self._rejected[reason if known else "other reasons"] += 1
         self._decoded += len(found)
         yield from found
 
 
 def _on_its_topic(record: Record) -> Record:
-    is_nmea = record.data.startswith(b"$")
+    is_nmea = record.data.lstrip().startswith(b"$")
     return dataclasses.replace(record, topic=record.topic + NMEA_SUFFIX) if is_nmea else record

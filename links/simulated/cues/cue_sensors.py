@@ -144,7 +144,8 @@ class CueSensors:
             }
             if s.heading_sigma_deg is not None:
                 fields["heading_deg"] = round((90.0 - float(np.degrees(yaw)) + heading_error_deg) % 360.0, 2)
-                fields["heading_sigma_deg"] = s.heading_sigma_deg
+                if s.heading_sigma_deg > 0.0:
+                    fields["heading_sigma_deg"] = s.heading_sigma_deg
             self._put(at_s, {"vehicle_gnss": fields})
 
     def _plan_ranging(self, s: RangingSettings, drone: Positions, rng: np.random.Generator) -> None:

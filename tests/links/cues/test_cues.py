@@ -12,6 +12,7 @@ from pydantic import ValidationError
 
 from flow.link import LinkError, Record
 from links.cues import Cues
+from links.cues.cues import MAX_REASONS
 from links.cues.parsing import CueParser
 from stages.messages import DroneGnss, UwbRange, VehicleGnss
 from tests.links import ports
@@ -28,11 +29,15 @@ def sentence(body: str) -> bytes:
 
 
 GGA = sentence("GNGGA,123519,4807.038,N,01131.000,W,1,08,0.9,545.4,M,46.9,M,,")
+GGA_6 = sentence("GNGGA,123519,4807.038,N,01131.000,W,6,08,0.9,545.4,M,46.9,M,,")  # dead reckoning
 
 
 def parse(content: object):
     data = content if isinstance(content, bytes) else json.dumps(content).encode()
-    return CueParser().parse(STAMP_NS, data)
+    found, rejected = CueParser().parse(STAMP_NS, data)
+    if rejected:
+        raise ValueError(rejected[0])
+    return found
 
 
 def test_each_cue_is_read():
@@ -52,14 +57,14 @@ def test_each_cue_is_read():
 
 def test_nmea_gives_position_and_the_heading_of_the_last_second():
     parser = CueParser()
-    assert parser.parse(STAMP_NS, sentence("GNHDT,274.07,T")) == []
-    (gnss,) = parser.parse(STAMP_NS + 500_000_000, GGA)
+    assert parser.parse(STAMP_NS, sentence("GNHDT,274.07,T")) == ([], [])
+    (gnss,), _ = parser.parse(STAMP_NS + 500_000_000, GGA)
     assert isinstance(gnss, VehicleGnss)
     assert math.degrees(gnss.latitude_rad) == pytest.approx(48 + 7.038 / 60)
     assert math.degrees(gnss.longitude_rad) == pytest.approx(-(11 + 31.0 / 60))
     assert gnss.altitude_m == 545.4
     assert math.degrees(gnss.yaw_enu_rad) == pytest.approx(360 + 90 - 274.07)
-    (later,) = parser.parse(STAMP_NS + 1_500_000_000, GGA)
+    (later,), _ = parser.parse(STAMP_NS + 1_500_000_000, GGA)
     assert later.yaw_enu_rad is None
 
 
@@ -76,22 +81,29 @@ def test_nmea_without_a_fix_and_other_sentences_are_no_cue():
         (b"[" * 1500, "neither JSON nor NMEA"),
         (b" " * 3000, "longer"),
         ([1, 2], "no JSON object"),
-        ({"other": 1}, "unknown cue"),
+        ({"other": 1}, "unknown field 'other'"),
+        ({"age_s": 0.1}, "no cue"),
+        ({"vehicle_gnss": PLACE | {"heading": 80}}, "unknown field 'heading'"),
+        ({"drone_gnss": PLACE | {"heading_deg": 80}}, "unknown field 'heading_deg'"),
+        ({"vehicle_gnss": PLACE | {"heading_deg": 80, "heading_sigma_deg": 0}}, "heading_sigma_deg is 0"),
         ({"vehicle_gnss": 5}, "latitude_deg"),
-        ({"vehicle_gnss": PLACE | {"latitude_deg": 91}}, "out of its range"),
+        ({"vehicle_gnss": PLACE | {"latitude_deg": 91}}, "latitude_deg is 91: not within -90 to 90"),
         ({"vehicle_gnss": PLACE | {"altitude_m": None}}, "altitude_m"),
-        ({"vehicle_gnss": PLACE | {"sigma_m": -1}}, "out of its range"),
+        ({"vehicle_gnss": PLACE | {"sigma_m": -1}}, "not within"),
         ({"vehicle_gnss": PLACE | {"heading_deg": "80"}}, "heading_deg"),
-        (b'{"uwb_range": {"range_m": NaN}}', "out of its range"),
-        (b'{"uwb_range": {"range_m": 1e999}}', "out of its range"),
-        (b'{"uwb_range": {"range_m": 1' + 400 * b"0" + b"}}", "out of its range"),
+        (b'{"uwb_range": {"range_m": NaN}}', "not within"),
+        (b'{"uwb_range": {"range_m": 1e999}}', "not within"),
+        (b'{"uwb_range": {"range_m": 1' + 400 * b"0" + b"}}", "not within"),
         ({"uwb_range": {"range_m": True}}, "range_m"),
-        ({"uwb_range": {"range_m": 2000}}, "out of its range"),
+        ({"uwb_range": {"range_m": 2000}}, "not within"),
         (GGA.replace(b"545.4", b"545.5"), "checksum"),
         (sentence("GNGGA,123519,4807.038,N"), "cut off"),
         (sentence("GNGGA,123519,4807.038,X,01131.000,W,1,08,0.9,545.4,M,46.9,M,,"), "hemisphere"),
-        (sentence("GNGGA,123519,nan,N,01131.000,W,1,08,0.9,545.4,M,46.9,M,,"), "out of its range"),
-        (sentence("GNHDT,,T"), "without a number"),
+        (sentence("GNGGA,123519,nan,N,01131.000,W,1,08,0.9,545.4,M,46.9,M,,"), "not within"),
+        (sentence("GNHDT,x,T"), "without a number"),
+        (sentence("GNHDT"), "cut off"),
+        (sentence("GNHDT,400,T"), "the heading is 400.0: not within 0 to 360"),
+        (GGA_6, "quality '6'"),
     ],
 )
 def test_what_is_no_cue_is_rejected_with_a_reason(content, reason):
@@ -103,7 +115,26 @@ def test_what_is_no_cue_is_rejected_with_a_reason(content, reason):
 def test_no_bytes_raise_anything_but_are_counted(data):
     cues = Cues()
     found = list(cues.decode(Record("/cues", STAMP_NS, STAMP_NS, data)))
-    assert len(found) + sum(cues.counters.rejected.values()) <= 1
+    assert len(found) + sum(cues.counters.rejected.values()) <= 1 + data.count(b"\n")
+
+
+def test_each_sentence_of_a_datagram_is_accepted_or_rejected_on_its_own():
+    parser = CueParser()
+    parser.parse(STAMP_NS, sentence("GNHDT,274.07,T"))
+    (gnss,), rejected = parser.parse(STAMP_NS, b"\r\n" + sentence("GNHDT,,T") + GGA + b"\r\n")
+    assert isinstance(gnss, VehicleGnss)
+    assert gnss.yaw_enu_rad is None  # the receiver has no heading any more
+    assert rejected == []
+    found, rejected = parser.parse(STAMP_NS, GGA.replace(b"545.4", b"545.5") + GGA)
+    assert (len(found), rejected) == (1, ["NMEA with a wrong checksum"])
+
+
+def test_the_number_of_reasons_that_are_counted_is_limited():
+    cues = Cues()
+    for k in range(100):
+        list(cues.decode(Record("/cues", STAMP_NS, STAMP_NS, json.dumps({f"field {k}": 1}).encode())))
+    assert len(cues.counters.rejected) == MAX_REASONS + 1
+    assert sum(cues.counters.rejected.values()) == 100
 
 
 def test_a_cue_arrives_by_udp_stamped_by_its_age_and_others_senders_are_ignored():

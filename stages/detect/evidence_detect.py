@@ -61,7 +61,7 @@ NEAR_REJECTED_M = 1.5  # a rejected object this close,
 NEAR_REJECTED_NS = 20_000_000_000  # and this recent, makes a new candidate less probable
 REVISITED_M = 0.5  # the same position
 MAX_STATIC = 64  # static objects remembered
-HYSTERESIS_NATS = 1.65  # an accepted candidate is rejected this far below the threshold
+HYSTERESIS_NATS = 1.65  # an accepted candidate is rejected this far below the threshold, by the LiDAR alone
 AT_REST_MPS = np.zeros(3)
 COMPARED_NS = 500_000_000  # a cue is compared with a candidate observed this recently,
 COMPARED_PASSES = 5  # in so many scan passes
@@ -291,7 +291,7 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
         self._add_cues(now, c)
         now.classified[c.number] = c
         accept = log_odds_of(settings.accept_probability)
-        c.accepted = c.log_odds >= accept or (c.accepted and c.log_odds >= accept - HYSTERESIS_NATS)
+        c.accepted = c.log_odds >= accept or (c.accepted and c.own_log_odds >= accept - HYSTERESIS_NATS)
         before, c.is_promising = c.is_promising, c.log_odds >= log_odds_of(settings.follow_up_probability)
         c.was_promising |= c.is_promising
         return c.was_promising or before != c.is_promising
@@ -302,19 +302,20 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
         A cue is of one object: it adds nothing to others while it matches an accepted candidate.
         """
         nats, remark = now.cues.nats(_object(c), now.trail, c.stamp_ns)
-        if not remark and c.cue_nats is None:
+        if not remark:
+            c.cue_nats = None
             return
         if nats > 0.0 and any(o is not c and o.accepted and (o.cue_nats or 0.0) > 0.0 for o in now.table):
             nats = 0.0
-        if remark and c.cue_nats is not None:
+        if c.cue_nats is not None:
             since_s = (c.stamp_ns - c.cue_ns) * 1e-9
             nats = min(nats, c.cue_nats + self.settings.cues.recovery_nats_per_s * since_s)
+        c.cue_nats, c.cue_ns = nats, c.stamp_ns
         if c.scan_passes < CUE_PASSES:
             nats = min(nats, max(log_odds_of(self.settings.accept_probability) - CUE_MARGIN_NATS - c.log_odds, 0.0))
-        c.cue_nats, c.cue_ns = nats, c.stamp_ns
         observed = min(c.log_odds, log_odds_of(self.settings.follow_up_probability))
-        c.log_odds = max(c.log_odds + nats, observed)  # a cue that lies does not end the observation of the drone
-        c.reason += f"; cues {nats:+.1f}" + (f" ({remark})" if remark else "")
+        c.log_odds = max(c.log_odds + nats, observed)  # a wrong cue does not end the observation of the drone
+        c.reason += f"; cues {nats:+.1f} ({remark})"
 
     def _count_pass_throughs(self, now: _State, part: Slice, now_ns: int) -> None:
         """Count the pulses that pass through a candidate's predicted position, scan pass by scan pass."""

@@ -70,7 +70,7 @@ def test_the_first_observations_alone_are_never_accepted_by_a_cue():
         assert all(p >= 0.0139 for p, n in few if n == 1)
 
 
-def test_a_balloon_exactly_at_a_lying_cue_is_not_accepted():
+def test_a_balloon_exactly_at_a_wrong_cue_is_not_accepted():
     place = still(*PLACE_M)
     _, detections = run([Ball(place, 0.25)], seconds=4.0, publish=Receiver(place))
     assert accepted_after_s(detections) == math.inf
@@ -99,3 +99,41 @@ def test_after_the_drone_is_known_the_cues_bias_is():
     assert last.trusted
     assert last.bias_m == pytest.approx((2.0, -2.0, 1.0), abs=0.4)
     assert last.bias_sigma_m < 1.0
+
+
+def classified(stage: EvidenceDetect, c, lidar_nats: float, monkeypatch):
+    """The candidate, classified with these log-odds by the LiDAR."""
+    monkeypatch.setattr("stages.detect.evidence_detect.classify", lambda *_: (lidar_nats, "made"))
+    stage._classify(stage._now, c)
+    return c
+
+
+def test_a_cue_does_not_keep_an_accepted_candidate_that_the_lidar_rejects(monkeypatch):
+    stage, c = EvidenceDetect(parked=True), candidate(observation(0.0, np.array(PLACE_M)))
+    c.scan_passes = 8
+    stage.on_cue(gnss(0.2, PLACE_M))
+    assert classified(stage, c, 3.5, monkeypatch).accepted
+    assert classified(stage, c, 2.0, monkeypatch).accepted  # hysteresis
+    assert not classified(stage, c, -0.7, monkeypatch).accepted  # 33 %, with the cue 79 %
+    assert c.log_odds == pytest.approx(1.3, abs=0.05)
+
+
+def test_what_limits_the_first_observations_does_not_limit_the_next(monkeypatch):
+    stage, c = EvidenceDetect(parked=True), candidate(observation(0.0, np.array(PLACE_M)))
+    stage.on_cue(gnss(0.2, PLACE_M))
+    for passes in (1, 2):
+        c.scan_passes = passes
+        assert classified(stage, c, 2.0, monkeypatch).log_odds == pytest.approx(math.log(19.0) - 0.5)
+    c.scan_passes = 3
+    assert classified(stage, c, 2.0, monkeypatch).log_odds == pytest.approx(4.0)
+
+
+def test_a_gap_of_the_cue_is_no_contradiction(monkeypatch):
+    stage, c = EvidenceDetect(parked=True), candidate(observation(0.0, np.array(PLACE_M)))
+    c.scan_passes = 8
+    stage.on_cue(gnss(0.2, PLACE_M))
+    assert classified(stage, c, 1.0, monkeypatch).log_odds == pytest.approx(3.0)
+    c.stamp_ns = START_NS + 2_000_000_000  # the cue is too old
+    assert classified(stage, c, 1.0, monkeypatch).log_odds == 1.0
+    stage.on_cue(gnss(2.2, PLACE_M))
+    assert classified(stage, c, 1.0, monkeypatch).log_odds == pytest.approx(3.0)

@@ -91,6 +91,13 @@ class CueEvidence:
             bias.compare(residual_m, noise_m2)
         return _state_of(cue, bias, offset_m, trail)
 
+    def reset(self) -> None:
+        """Frame map has changed: biases begin at their priors, measurements are removed, trust remains."""
+        for cue in self._cues.values():
+            if cue.newest:
+                cue.bias = CueBias(cue.newest[-1].bias_covariance_m2, cue.bias.trusted)
+                cue.newest.clear()
+
     def nats(self, c: ObjectState, trail: VehicleTrajectory, now_ns: int) -> tuple[float, str]:
         """What all cues add to the log-odds that an object is the drone, and the remark for people."""
         by_source: dict[str, float] = {}

@@ -367,6 +367,7 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
         now.table.keep(())
         now.static.clear()
         now.watches.clear()
+        now.cues.reset()
         return gone
 
     def _remember_rejected(self, now: _State, c: Candidate) -> None:

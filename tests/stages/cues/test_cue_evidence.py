@@ -165,3 +165,17 @@ def test_a_cue_of_another_kind_starts_a_new_bias_but_stays_distrusted():
         evidence.add(gnss(PLACE_M + np.array([30.0, 0, 0]), 0.2 * k), TRAIL, [thing(t_s=0.2 * k)])
     level = cue("gnss", CueKind.LEVEL_AND_HEIGHT, [13.0, 9.0], 0.3, 3.5, 1.0)
     assert not evidence.add(level, TRAIL, []).trusted
+
+
+def test_a_new_frame_map_restores_the_priors_and_keeps_the_trust():
+    evidence, range_m = CueEvidence(CueWeights(), SEARCH_M), float(np.linalg.norm(PLACE_M))
+    for k in range(10):
+        evidence.add(gnss(PLACE_M + np.array([2.0, -3.0, 1.0]), 0.2 * k), TRAIL, [thing(t_s=0.2 * k)])
+        evidence.add(uwb(range_m + 20.0, 0.2 * k), TRAIL, [thing(t_s=0.2 * k)])
+    evidence.reset()
+    assert evidence.nats(thing(t_s=1.8), TRAIL, START_NS + 1_800_000_000) == (0.0, "")
+    state = evidence.add(gnss(t_s=2.0), TRAIL, [])
+    assert state.bias_m == pytest.approx(np.zeros(3))
+    assert state.bias_sigma_m == pytest.approx(3.5)
+    assert state.trusted
+    assert not evidence.add(uwb(range_m, 2.0), TRAIL, []).trusted

@@ -137,3 +137,13 @@ def test_a_gap_of_the_cue_is_no_contradiction(monkeypatch):
     assert classified(stage, c, 1.0, monkeypatch).log_odds == 1.0
     stage.on_cue(gnss(2.2, PLACE_M))
     assert classified(stage, c, 1.0, monkeypatch).log_odds == pytest.approx(3.0)
+
+
+def test_a_jump_of_frame_map_removes_the_cues_of_the_old_one():
+    stage, c = EvidenceDetect(parked=True), candidate(observation(0.0, np.array(PLACE_M)))
+    c.scan_passes = 8
+    stage.on_cue(gnss(0.2, PLACE_M))
+    stage._now.odometry_jumped = True
+    stage._prune(stage._now, c.stamp_ns)
+    stage._add_cues(stage._now, c)
+    assert c.cue_nats is None

@@ -5,14 +5,14 @@ Source: ours.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 from links.cues.cues import Cues
 from links.preflight.check_result import CheckResult, ok, warning
 from links.preflight.link_checks import LinkChecks
 from links.preflight.observations import Observations, ObservedSource
-
-OLD_MS = 1_000.0  # age at which the detector does not use a cue; latency of the sensor not included
+from links.vehicle_odometry.udp import MAX_AGE_S, WRONG_AGE
 
 
 class CuesChecks(LinkChecks):
@@ -23,16 +23,20 @@ class CuesChecks(LinkChecks):
     def check_source(self, source: ObservedSource, observations: Observations) -> Iterator[CheckResult]:
         """See LinkChecks."""
         assert isinstance(source.link, Cues)
-        records = source.observation.records
-        if not records.count:
-            yield warning(source.name, f"{source.no_data_reason}: the search goes on without cues")
-            return
-        rejected, age_ms = sum(source.counters.rejected.values()), 1e-6 * records.max_age_ns
-        text = f"{records.rate_hz:.0f} datagrams/s, at most {age_ms:.0f} ms old"
-        if rejected:
+        topics = [source.observation.topics[topic] for topic in source.link.replay_topics]
+        topics = [records for records in topics if records.count]
+        problems: list[str] = []
+        if wrong := source.counters.get(WRONG_AGE, 0):
+            above = f"invalid or above {MAX_AGE_S:.0f} s: check age_s and the sender's clock"
+            problems.append(f"{wrong} datagrams with an age_s that is {above}")
+        if source.counters.rejected:
             why = ", ".join(f"{count} x '{reason}'" for reason, count in source.counters.rejected.items())
-            yield warning(source.name, f"{text}; rejected: {why}")
-        elif age_ms > OLD_MS:
-            yield warning(source.name, f"{text}: older than 1 s, they are not used; check age_s")
-        else:
-            yield ok(source.name, text)
+            problems.append(f"rejected: {why}")
+        if not topics:
+            reason = "; ".join(problems) or source.no_data_reason
+            yield warning(source.name, f"{reason}: the search goes on without cues")
+            return
+        rate_hz = sum(records.rate_hz for records in topics if not math.isnan(records.rate_hz))
+        age_ms = 1e-6 * max(records.max_age_ns for records in topics)
+        text = f"{rate_hz:.0f} datagrams/s, at most {age_ms:.0f} ms old"
+        yield warning(source.name, "; ".join([text, *problems])) if problems else ok(source.name, text)

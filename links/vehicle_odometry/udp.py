@@ -24,6 +24,7 @@ from links.clock import datagram_time
 DATAGRAM_BYTES = 4096
 WAKE_S = 0.2  # how often a waiting listener checks whether it was closed
 MAX_AGE_S = 1.0
+WRONG_AGE = "age_s invalid or too large"  # counter
 
 
 @contextmanager
@@ -69,7 +70,7 @@ def _records(
             continue
         age = age_s(data)
         if age is None:
-            counters["age_s invalid or too large"] += 1
+            counters[WRONG_AGE] += 1
             continue
         yield Record(topic, arrival_ns, arrival_ns - round(1e9 * age), data)
 

@@ -53,7 +53,9 @@ class ObservationTap(Tap):
 
     def attach(self, sources: Mapping[str, Source]) -> None:
         """Set the sources whose records will arrive, by node name."""
-        self._by_topic = {source.topic: checks_for(source).observation(source) for source in sources.values()}
+        for source in sources.values():
+            observation = checks_for(source).observation(source)
+            self._by_topic |= dict.fromkeys(source.replay_topics, observation)
         self._topics = {name: source.topic for name, source in sources.items()}
 
     def wants(self, message: type[Message]) -> bool:

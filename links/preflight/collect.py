@@ -53,6 +53,7 @@ class ObservationTap(Tap):
 
     def attach(self, sources: Mapping[str, Source]) -> None:
         """Set the sources whose records will arrive, by node name."""
+        self._by_topic = {}
         for source in sources.values():
             observation = checks_for(source).observation(source)
             self._by_topic |= dict.fromkeys(source.replay_topics, observation)

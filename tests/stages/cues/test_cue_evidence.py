@@ -9,8 +9,9 @@ import pytest
 
 from stages.cues.bias import AGREEMENTS, CONTRADICTIONS, CueBias
 from stages.cues.evidence import CueEvidence, CueWeights, ObjectState, measure
+from stages.geometry.frames import rotation_z
 from stages.geometry.trajectory import VehicleTrajectory
-from stages.messages import CueKind, DroneCue
+from stages.messages import CueKind, DroneCue, VehicleMotion
 from tests.stages.made import START_NS
 
 TRAIL = VehicleTrajectory()
@@ -179,3 +180,11 @@ def test_a_new_frame_map_restores_the_priors_and_keeps_the_trust():
     assert state.bias_sigma_m == pytest.approx(3.5)
     assert state.trusted
     assert not evidence.add(uwb(range_m, 2.0), TRAIL, []).trusted
+
+
+def test_the_position_for_the_search_is_in_the_axes_of_the_turned_vehicle():
+    trail = VehicleTrajectory()
+    xyz_m = np.array([50.0, 20.0, 0.0])
+    trail.add(VehicleMotion(stamp_ns=START_NS, xyz_map_m=xyz_m, R_map_vehicle=rotation_z(0.7), covariance=None))
+    state = CueEvidence(CueWeights(), SEARCH_M).add(gnss(rotation_z(0.7) @ PLACE_M), trail, [])
+    assert state.xyz_vehicle_m == pytest.approx(PLACE_M)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -176,3 +177,60 @@ def test_a_cue_that_is_null_is_not_used():
     stage.on_vehicle_gnss(vehicle(0.0))
     assert stage.on_gnss(drone(0.0, (1.0, 2.0, 3.0))) is None
     assert stage.on_uwb(UwbRange(stamp_ns=at(0.0), range_m=17.0, sigma_m=None)) is None
+
+
+ANTENNA_M = (2.0, 0.5, 1.0)
+
+
+def antenna_m(xyz_map_m, yaw_rad: float):
+    return np.asarray(xyz_map_m) + rotation_z(yaw_rad) @ np.array(ANTENNA_M)
+
+
+def test_the_antenna_of_a_turned_vehicle_and_its_motion_count_in_each_kind_of_cue():
+    drone_m, yaw_rad = (12.0, -5.0, 9.0), 2.0
+    for heading in (yaw_rad, None):
+        stage = RelativeCues(gnss={"antenna_vehicle_m": ANTENNA_M})
+        for t_s in (0.0, 0.4):
+            stage.on_motion(motion(t_s, (10.0 * t_s, 0.0, 5.0 * t_s), yaw_rad))
+        stage.on_vehicle_gnss(vehicle(0.0, antenna_m((0.0, 0.0, 0.0), yaw_rad), heading))
+        cue = stage.on_gnss(drone(0.4, drone_m))
+        assert cue is not None
+        if heading is not None:
+            assert cue.value_m == pytest.approx([8.0, -5.0, 7.0], abs=0.01)
+            continue
+        start_m = antenna_m((0.0, 0.0, 0.0), yaw_rad)
+        level_m, moved_m = np.linalg.norm(drone_m[:2] - start_m[:2]), start_m[:2] - (4.0, 0.0)
+        assert cue.value_m == pytest.approx([level_m, 7.0], abs=0.01)
+        assert cue.covariance_m2[0, 0] == pytest.approx(2 * 0.3**2 + moved_m @ moved_m)  # its direction is unknown
+
+
+def test_the_course_is_that_of_the_antenna_on_a_curve():
+    stage = RelativeCues(gnss={"antenna_vehicle_m": ANTENNA_M})
+    for step in range(11):
+        t_s, yaw_rad = 0.2 * step, 0.15 * step
+        here_m = (10.0 * math.sin(yaw_rad), 10.0 - 10.0 * math.cos(yaw_rad), 0.0)
+        stage.on_motion(motion(t_s, here_m, yaw_rad))
+        stage.on_vehicle_gnss(vehicle(t_s, antenna_m(here_m, yaw_rad), None))
+    cue = stage.on_gnss(drone(2.0, np.array([12.0, -5.0, 9.0]) + here_m))
+    assert cue is not None
+    assert cue.kind is CueKind.POSITION
+    assert cue.value_m == pytest.approx([12.0, -5.0, 9.0], abs=0.05)
+
+
+def test_a_new_frame_map_has_another_north():
+    stage = RelativeCues()
+    stage.on_motion(motion(0.0, (0.0, 0.0, 0.0)))
+    stage.on_vehicle_gnss(vehicle(0.0))
+    stage.on_motion(motion(3.0, (0.0, 0.0, 0.0)))  # an odometry may have restarted during the gap
+    stage.on_vehicle_gnss(vehicle(3.0, yaw_map_rad=None))
+    cue = stage.on_gnss(drone(3.0, (12.0, -5.0, 9.0)))
+    assert cue is not None
+    assert cue.kind is CueKind.LEVEL_AND_HEIGHT
+
+
+def test_a_receiver_that_reports_a_larger_error_is_used_with_it():
+    stage = RelativeCues()
+    stage.on_vehicle_gnss(replace(vehicle(0.0, yaw_map_rad=None), sigma_m=4.0, sigma_up_m=7.0))
+    cue = stage.on_gnss(replace(drone(0.0, (12.0, -5.0, 9.0)), sigma_m=3.0, sigma_up_m=5.0))
+    assert cue is not None
+    assert cue.bias_covariance_m2 == pytest.approx(np.diag([4.0**2 + 3.0**2, 7.0**2 + 5.0**2]))

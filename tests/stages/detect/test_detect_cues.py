@@ -147,3 +147,15 @@ def test_a_jump_of_frame_map_removes_the_cues_of_the_old_one():
     stage._prune(stage._now, c.stamp_ns)
     stage._add_cues(stage._now, c)
     assert c.cue_nats is None
+
+
+def test_a_cue_is_compared_only_with_what_the_lidar_alone_accepts(monkeypatch):
+    stage = EvidenceDetect(parked=True, cues={"max_gnss": 6.0, "max_sum": 6.0})
+    c = candidate(observation(0.0, np.array(PLACE_M)))
+    c.scan_passes = 8
+    stage._now.table.put(c)
+    stage.on_cue(gnss(0.2, PLACE_M))
+    assert classified(stage, c, 1.0, monkeypatch).accepted
+    assert math.isnan(stage.on_cue(gnss(0.3, PLACE_M)).offset_m)
+    classified(stage, c, 3.5, monkeypatch)
+    assert stage.on_cue(gnss(0.4, PLACE_M)).offset_m == pytest.approx(0.0, abs=1e-9)

@@ -185,8 +185,8 @@ def read_gps_raw(frame: Any, stamp_ns: int) -> DroneGnss:
 
 def read_global_position(frame: Any, stamp_ns: int) -> DroneGlobalPosition:
     """GLOBAL_POSITION_INT."""
-    place: dict[str, Any] = {**_geographic(frame), "altitude_above_home_m": 1e-3 * frame.relative_alt}
-    return DroneGlobalPosition(stamp_ns=stamp_ns, **place)
+    position: dict[str, Any] = {**_geographic(frame), "altitude_above_home_m": 1e-3 * frame.relative_alt}
+    return DroneGlobalPosition(stamp_ns=stamp_ns, **position)
 
 
 def read_distance_sensor(frame: Any, stamp_ns: int) -> UwbRange:

@@ -1,3 +1,3 @@
-"""Cues: where other sensors place the drone. They direct the search and are evidence with a cap, never a position."""
+"""Cues: where the drone is by other sensors. They direct the search and are evidence with a cap, never a position."""
 
 from stages.cues.relative_cues import RelativeCues as RelativeCues

@@ -1,4 +1,4 @@
-"""Bias of a cue: its slowly changing error, estimated while the LiDAR sees the drone; and whether the cue lies.
+"""Bias of a cue: its slowly changing error, estimated while the LiDAR sees the drone; and whether the cue is wrong.
 
     b' = -b / T + w,   stationary covariance B        (first-order Gauss-Markov; before any comparison b ~ N(0, B))
     r  = b + v         residual of the cue to the LiDAR

@@ -3,10 +3,10 @@
     nats = ln[ (1 - e) N(z; h(x) + b, S) / p_0 + e ],   at most the cue's cap;  at least ln e
 
 z: measurement, h(x): the same of the candidate's position x at that time, b and S: bias and covariance of the cue and
-of the candidate, p_0: density of z for an object anywhere within the search range, e: probability that a
-cue is of another object. Of the newest three measurements of a cue the median counts: a single reflection changes
-nothing. The caps are the safety: with the largest sum a candidate must reach 72 % by the LiDAR alone. A cue that
-contradicts the candidate removes what the others add.
+of the candidate, p_0: density of z for an object anywhere within the search range R, 3 / (2 pi R^3) for a position and
+1 / R for each scalar, e: probability that a cue is of another object. Of the newest three measurements of a cue the
+median counts: a single reflection changes nothing. The caps are the safety: with the largest sum a
+candidate must reach 72 % by the LiDAR alone. A cue that contradicts the candidate removes what the others add.
 
 A cue that contradicts the drone found by the LiDAR alone is not used and is reported (`bias.py`).
 

@@ -1,6 +1,7 @@
 """Cues about where the drone is, from sensors other than LiDAR and cameras: GNSS, ranging, barometer.
 
-None of them is needed, and none is believed: they direct the search and are evidence with a cap (`stages/cues`).
+None of them is needed, and none is accepted as a position: they direct the search and are evidence with a cap
+(`stages/cues`).
 
 Source: ours.
 """
@@ -88,7 +89,7 @@ class CueState(Message):
     """
 
     source: str
-    trusted: bool  # False: it contradicts the LiDAR or another cue, and is not used
+    trusted: bool  # False: it contradicts the drone that the LiDAR found, and is not used
     reason: str
     bias_m: PerPointF64  # (n,) estimate of the slowly changing error
     bias_sigma_m: float  # largest

@@ -1,1 +1,1 @@
-"""Simulated sensors behind cues: GNSS receivers, ranging radios, a barometer; with their lies."""
+"""Simulated sensors behind cues: GNSS receivers, ranging radios, a barometer; also wrong ones."""

@@ -40,8 +40,8 @@ class ReceiverSettings(_Settings):
     bias_time_s: float = Field(default=200.0, gt=1)
     noise_m: float = Field(default=0.3, ge=0, le=100)
     noise_up_m: float = Field(default=0.5, ge=0, le=100)
-    offset_world_m: Vector3 = (0.0, 0.0, 0.0)  # a lie
-    of_drone: int = Field(default=1, ge=1, le=10)  # another one's: a lie
+    offset_world_m: Vector3 = (0.0, 0.0, 0.0)  # a wrong cue
+    of_drone: int = Field(default=1, ge=1, le=10)  # another one's: a wrong cue
     heading_sigma_deg: float | None = Field(default=None, ge=0, le=45)  # constant error of a heading; None: no heading
 
 
@@ -54,7 +54,7 @@ class RangingSettings(_Settings):
     bias_m: float = Field(default=0.1, ge=0, le=100)
     reflected_share: float = Field(default=0.05, ge=0, le=1)
     reflected_m: float = Field(default=2.0, ge=0, le=100)  # mean additional way
-    offset_m: float = 0.0  # a lie
+    offset_m: float = 0.0  # a wrong cue
     of_drone: int = Field(default=1, ge=1, le=10)
 
 
@@ -64,7 +64,7 @@ class BarometerSettings(_Settings):
     drift_m: float = Field(default=1.0, ge=0, le=100)
     drift_time_s: float = Field(default=120.0, gt=1)
     noise_m: float = Field(default=0.1, ge=0, le=100)
-    offset_m: float = 0.0  # a lie
+    offset_m: float = 0.0  # a wrong cue
 
 
 class CueSettings(_Settings):

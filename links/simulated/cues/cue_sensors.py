@@ -136,11 +136,13 @@ class CueSensors:
         rotations, positions = self._vehicle(measured_s)
         measured_m = positions + error.at(measured_s) + np.array(s.offset_world_m)
         yaw_rad = np.arctan2(rotations[:, 1, 0], rotations[:, 0, 0]) + self._yaw_enu_rad
-        for at_s, place, yaw in zip(sent_s.tolist(), geographic(measured_m, self._yaw_enu_rad), yaw_rad, strict=True):
+        for at_s, position, yaw in zip(
+            sent_s.tolist(), geographic(measured_m, self._yaw_enu_rad), yaw_rad, strict=True
+        ):
             fields = {
-                "latitude_deg": round(float(np.degrees(place.latitude_rad)), 9),
-                "longitude_deg": round(float(np.degrees(place.longitude_rad)), 9),
-                "altitude_m": round(place.altitude_m, 3),
+                "latitude_deg": round(float(np.degrees(position.latitude_rad)), 9),
+                "longitude_deg": round(float(np.degrees(position.longitude_rad)), 9),
+                "altitude_m": round(position.altitude_m, 3),
             }
             if s.heading_sigma_deg is not None:
                 fields["heading_deg"] = round((90.0 - float(np.degrees(yaw)) + heading_error_deg) % 360.0, 2)

@@ -1,4 +1,4 @@
-"""Table of the first fix with and without each cue, and of false acceptances with cues that lie.
+"""Table of the first fix with and without each cue, and of false acceptances with wrong cues.
 
     python -m links.simulated.matrix.cue_table OUT --only 'campus-20m-hover-parked' --seeds 2
 
@@ -55,10 +55,10 @@ VARIANTS: dict[str, dict[str, Any] | None] = {
     "uwb": RANGING,
     "altitude": {"drone": {}, "barometer": {}},
     "all": ALL,
-    "lie: gnss 30 m off": {**GNSS, "drone": OFF_M},
-    "lie: gnss 30 m off, uwb true": {**GNSS, **RANGING, "drone": OFF_M},
-    "lie: uwb 15 m off": {"ranging": {"offset_m": 15.0}},
-    "lie: all of another drone": {
+    "wrong: gnss 30 m off": {**GNSS, "drone": OFF_M},
+    "wrong: gnss 30 m off, uwb true": {**GNSS, **RANGING, "drone": OFF_M},
+    "wrong: uwb 15 m off": {"ranging": {"offset_m": 15.0}},
+    "wrong: all of another drone": {
         "drone": {"of_drone": 2},
         "vehicle": {"heading_sigma_deg": 2.0},
         "ranging": {"of_drone": 2},

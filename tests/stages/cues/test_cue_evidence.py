@@ -1,4 +1,4 @@
-"""Cues as evidence: caps, outliers, biases, and cues that lie."""
+"""Cues as evidence: caps, outliers, biases, and wrong cues."""
 
 from __future__ import annotations
 

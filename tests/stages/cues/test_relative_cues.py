@@ -24,7 +24,7 @@ def at(t_s: float) -> int:
     return START_NS + round(1e9 * t_s)
 
 
-def place(xyz_map_m) -> Geographic:
+def geographic(xyz_map_m) -> Geographic:
     return moved(TOKYO, rotation_z(-NORTH_RAD) @ np.asarray(xyz_map_m, dtype=np.float64))
 
 
@@ -32,7 +32,7 @@ def vehicle(t_s: float, xyz_map_m=(0.0, 0.0, 0.0), yaw_map_rad: float | None = 0
     """As its receiver reports it: LATENCY_S late."""
     return VehicleGnss(
         stamp_ns=at(t_s + LATENCY_S),
-        **place(xyz_map_m)._asdict(),
+        **geographic(xyz_map_m)._asdict(),
         sigma_m=None,
         sigma_up_m=None,
         yaw_enu_rad=None if yaw_map_rad is None else yaw_map_rad - NORTH_RAD,
@@ -41,7 +41,7 @@ def vehicle(t_s: float, xyz_map_m=(0.0, 0.0, 0.0), yaw_map_rad: float | None = 0
 
 
 def drone(t_s: float, xyz_map_m) -> DroneGnss:
-    return DroneGnss(stamp_ns=at(t_s + LATENCY_S), **place(xyz_map_m)._asdict(), sigma_m=None, sigma_up_m=None)
+    return DroneGnss(stamp_ns=at(t_s + LATENCY_S), **geographic(xyz_map_m)._asdict(), sigma_m=None, sigma_up_m=None)
 
 
 def motion(t_s: float, xyz_map_m, yaw_rad: float = 0.0) -> VehicleMotion:
@@ -136,7 +136,7 @@ def test_gnss_that_is_too_old_or_of_another_place_is_not_used():
 
 def test_the_autopilots_position_replaces_a_silent_receiver_and_never_after_a_sent_pose():
     position = DroneGlobalPosition(
-        stamp_ns=at(LATENCY_S), **place((4.0, 3.0, 9.0))._asdict(), altitude_above_home_m=10.0, independent=True
+        stamp_ns=at(LATENCY_S), **geographic((4.0, 3.0, 9.0))._asdict(), altitude_above_home_m=10.0, independent=True
     )
     stage = RelativeCues(altitude={"home_up_m": -1.8})
     stage.on_vehicle_gnss(vehicle(0.0))
@@ -145,13 +145,13 @@ def test_the_autopilots_position_replaces_a_silent_receiver_and_never_after_a_se
     assert sources["gnss"].value_m == pytest.approx([4.0, 3.0, 9.0], abs=0.01)
     stage.on_gnss(drone(0.0, (4.0, 3.0, 9.0)))
     assert [cue.source for cue in stage.on_global_position(position)] == ["altitude"]
-    echo = DroneGlobalPosition(stamp_ns=at(0.3), **place((0.0, 0.0, 9.0))._asdict(), altitude_above_home_m=10.0)
+    echo = DroneGlobalPosition(stamp_ns=at(0.3), **geographic((0.0, 0.0, 9.0))._asdict(), altitude_above_home_m=10.0)
     assert stage.on_global_position(echo) == []
 
 
 def test_the_autopilots_position_is_its_estimate_at_its_stamp():
     position = DroneGlobalPosition(
-        stamp_ns=at(0.4), **place((12.0, 0.0, 9.0))._asdict(), altitude_above_home_m=10.0, independent=True
+        stamp_ns=at(0.4), **geographic((12.0, 0.0, 9.0))._asdict(), altitude_above_home_m=10.0, independent=True
     )
     stage = RelativeCues(altitude={"home_up_m": 0.0})
     for t_s in (0.0, 0.4):

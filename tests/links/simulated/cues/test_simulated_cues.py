@@ -1,4 +1,4 @@
-"""Simulated cues: what the receivers report is the truth with the errors that the settings state; lies; same bytes."""
+"""Simulated cues: what the receivers report is the truth with the errors that the settings state; wrong cues; same bytes."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ def messages_of(cues: dict, seconds: float = 3.0):
     return simulation, found
 
 
-def world_m(place) -> np.ndarray:
+def world_m(message) -> np.ndarray:
     """Position in the world frame."""
-    here = Geographic(place.latitude_rad, place.longitude_rad, place.altitude_m)
+    here = Geographic(message.latitude_rad, message.longitude_rad, message.altitude_m)
     return rotation_z(-YAW_ENU_WORLD_RAD) @ displacement_enu_m(ORIGIN, here)
 
 
@@ -106,12 +106,12 @@ def test_reflections_only_lengthen_a_range():
     assert 0.1 < np.mean(np.array(extra_m) > 0.1) < 0.5
 
 
-def test_a_lie_is_off_by_its_offset():
-    true, lie = (
+def test_a_wrong_cue_is_off_by_its_offset():
+    true, wrong = (
         next(m for m in messages_of({"drone": {**EXACT, "offset_world_m": off}}, 1.0)[1] if isinstance(m, DroneGnss))
         for off in ((0.0, 0.0, 0.0), (30.0, 0.0, 0.0))
     )
-    assert world_m(lie) - world_m(true) == pytest.approx([30.0, 0.0, 0.0], abs=0.03)
+    assert world_m(wrong) - world_m(true) == pytest.approx([30.0, 0.0, 0.0], abs=0.03)
 
 
 def test_the_same_seed_gives_the_same_bytes_and_cues_do_not_change_the_drones_flight():

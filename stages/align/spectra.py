@@ -157,7 +157,7 @@ def match_probabilities(found: list[Peak]) -> Array64:
     """Probability (n,) that each match is the right one; 1 - sum: that none is.
 
     A softmax of the likenesses and of NONE_LIKENESS. Both constants maximise the likelihood of the true matches of 410
-    pairs of images of ten simulated flights in five kinds of scenes: tests/benchmarks/accuracy/bench_measured_errors.py.
+    pairs of images of ten simulated flights in five kinds of scenes (bench_measured_errors.py).
     """
     score = LIKENESS_WEIGHT * np.array([*(peak.likeness for peak in found), NONE_LIKENESS])
     share = np.exp(score - score.max())

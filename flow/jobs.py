@@ -25,7 +25,7 @@ from flow.link import LinkError
 POLL_S = 0.2  # period of progress reports
 REPORT_S = 0.5  # least time between two reports of a task
 CONNECT_S = 10
-LOST_WORKERS = 2  # a task is given up when it has lost more
+LOST_WORKERS = 2  # on this machine a task is given up when it has lost more
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -93,9 +93,7 @@ def _on_workers(
                 progress(shares)
             return [future.result() for future in futures]
         except distributed.KilledWorker:
-            raise LinkError(
-                f"{LOST_WORKERS + 1} workers were lost with the same task: if memory is short, use fewer --jobs"
-            ) from None
+            raise LinkError("too many workers were lost with the same task: if memory is short, use fewer") from None
         finally:
             stop.set()
             client.cancel([future for future in futures if not future.done()], force=False)

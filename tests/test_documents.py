@@ -37,6 +37,12 @@ def test_every_command_in_a_document_exists(file):
 
 
 @pytest.mark.parametrize("file", DOCUMENTS, ids=name_of)
+def test_every_test_and_benchmark_in_a_document_exists(file):
+    for path in re.findall(r"\btests/[\w/]+\.py\b", file.read_text(encoding="utf-8")):
+        assert (ROOT / path).is_file(), f"{name_of(file)} names {path}"
+
+
+@pytest.mark.parametrize("file", DOCUMENTS, ids=name_of)
 def test_every_configuration_in_a_document_exists(file):
     made = {
         "configs/mine.yaml",

@@ -118,7 +118,7 @@ def _read(folder: Path, index: int, thin: bool) -> pd.DataFrame:
         if wrong.any():
             row = int(wrong.argmax())
             text = "missing" if empty[row] else f"'{frame[name].iloc[row]}', not a finite number"
-            raise LinkError(f"{file}:{row + 2}: {name} is {text}")
+            raise LinkError(f"{file}:{row + 2}: {name} is {text}; replay the recording with this version of grd")
     frame["stamp_ns"] = [int(s) * 10**9 + int(f.ljust(9, "0")) for s, f in (t.split(".") for t in frame.stamp_s)]
     known, frame["is_drone"] = _labels(folder, frame)
     frame = frame.assign(run=index, seed=_seed(folder)).loc[known]

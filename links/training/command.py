@@ -140,7 +140,8 @@ def _ablated(group: str, unseen: CandidateRows, probability: Array64) -> dict[st
         if here.any():
             brier, log_loss = brier_and_log_loss(probability[here], unseen.is_drone[here])
             found[name] = [round(brier, 5), round(log_loss, 4)]
-            out.print(f"without '{group}', {name}: Brier {brier:.5f}, log loss {log_loss:.4f}", markup=False)
+            left_out = "all features" if group == "nothing" else f"without '{group}'"
+            out.print(f"{left_out}, {name}: Brier {brier:.5f}, log loss {log_loss:.4f}", markup=False)
     return found
 
 

@@ -11,6 +11,8 @@ Every confirmed track is an object that moves; the oldest one is published as th
 surroundings are not used. Standing objects (lamps, wires, edges) are separated by displacement alone, so a drone that
 hovers is not found; with `least_moved_m: 0` it is, and so is everything else that is small.
 
+The settings were chosen by hand on one flight that is in no table (docs/reference/detection.md).
+
 Source: ours, of the usual parts: Ester et al., "DBSCAN", KDD (1996); `stages/track/imm_pdaf.py`.
 """
 

@@ -3,7 +3,7 @@
     F = {returns of this frame within r of t^0},  t^0 = the last frame's t,  then `stages/track/mean_shift.py`
 
 A detection is one pixel of the depth image. With `refine_detection` the track starts where the mean shift over the
-returns of that scan within r of it ends.
+returns of that scan within r of it ends: those of the last two sweeps, in axes of a vehicle that stands, as in P III.
 
 The state is SEARCHING until a detection is accepted, then TRACKING. Frames without returns are normal, because the
 beams also point in other directions. After `lost_after_s` without returns the state is LOST for one frame, then

@@ -83,6 +83,8 @@ def test_a_group_counts_accurate_false_and_empty_runs(three_runs):
     assert park["track accuracy [%]"] == 0
     assert street["3D RMSE median [m]"] == pytest.approx(0, abs=1e-6)
     assert street["false [/h]"] == pytest.approx(100 / (20 / 3600))
+    assert whole["false tracks [/h]"] == pytest.approx(1 / (30 / 3600))
+    assert whole["below [/h] (95 %)"] == pytest.approx(4.744 / (30 / 3600), rel=1e-3)  # Poisson, 1 event
 
 
 def test_numbers_are_in_their_order_and_each_run_is_in_one_group(three_runs):

@@ -221,6 +221,14 @@ def test_precision_and_gospa_of_a_run_with_a_second_track_that_is_false(tmp_path
     assert (value(one, "false_tracks"), value(two, "false_tracks")) == (0, 1)
 
 
+def test_an_output_counts_for_precision_and_gospa_only_while_it_is_recent(tmp_path):
+    """Exact outputs for the first half of the run: then a miss, which is sqrt(1/2) m."""
+    half = EIGHT_HZ[EIGHT_HZ <= 5.0]
+    e = evaluated(make_run(tmp_path / "half", half, truth_at(half) + np.array([0.0, 0.0, 0.1])))
+    assert value(e, "precision") == 100.0
+    assert value(e, "gospa_m") == pytest.approx(0.5 * 0.1 + 0.5 * math.sqrt(0.5), abs=0.05)
+
+
 def test_false_tracks_have_a_rate_and_a_bound_with_and_without_a_drone(tmp_path):
     t = np.array([0.0, 0.5, 4.0, 4.5])
     beside = evaluated(make_run(tmp_path / "a", t, truth_at(t) + np.array([0.0, 5.0, 0.0])))

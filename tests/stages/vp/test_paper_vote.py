@@ -129,9 +129,24 @@ def test_two_segments_vote_for_the_pixel_where_their_lines_meet():
 
 def test_lines_that_meet_outside_the_view_or_are_parallel_have_no_vote():
     for other in ([60, 65, 70, 70], [0, 20, 20, 20], [60, 50, 60, 90]):  # at u = -50, parallel, at right angles
-        votes, sums = vote_in_image(np.array([[0.0, 10, 20, 10], other]), 100, 10)
+        votes, _ = vote_in_image(np.array([[0.0, 10, 20, 10], other]), 100, 10)
         assert votes.sum() == pytest.approx(0.0, abs=1e-9)
-        assert fullest_in_image(votes, sums)[2] < 1.0 or votes.sum() == 0.0
+
+
+def test_the_image_begins_half_a_pixel_before_the_centre_of_its_first_pixel():
+    """Lines that meet at u = 29.6: 30.1 px from the edge, in the fourth cell of 10 px."""
+    segments = np.array([[0.0, 10, 20, 10], [59.6, 40, 69.6, 50]])
+    votes, _ = vote_in_image(segments, 100, 10)
+    assert votes[1, 3] == pytest.approx(votes.sum())
+
+
+def test_the_fullest_place_counts_the_neighbours_of_a_cell():
+    votes, sums = np.zeros((6, 6)), np.zeros((6, 6, 2))
+    votes[0, 0] = 3.0  # the fullest cell
+    votes[3:5, 3:5] = 2.0  # the fullest block
+    sums[0, 0] = 3.0 * np.array([5.0, 5.0])
+    sums[3:5, 3:5] = 2.0 * np.array([40.0, 42.0])
+    assert fullest_in_image(votes, sums) == pytest.approx((40.0, 42.0, 8 / 11))
 
 
 def test_the_fullest_cell_of_the_image_is_where_most_lines_meet():

@@ -18,13 +18,39 @@ from links.evaluation.association import EvaluationLimits
 JSON_FILE, DEFAULTS = "evaluation.json", EvaluationLimits()
 NEEDED = ("pandas", "matplotlib")  # evo is optional: without it its metrics are not evaluated
 
+Against = Annotated[
+    list[Path] | None, typer.Option("--against", help="A run to compare with, of the same recording; repeatable.")
+]
+By = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--by",
+        metavar="FIELD",
+        help="Group by a field of the recordings' names (2 of SCENE-RANGE-...), by several (2,3) or by "
+        "configuration alone (config). Configurations are side by side in any case. Repeatable.",
+    ),
+]
+TablesFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--paper-tables",
+        help="Markdown file to write: the paper's Tables I and II with the runs of recordings named "
+        "experiment_1 ... experiment_4-... next to them.",
+    ),
+]
+MaxGap = Annotated[
+    float, typer.Option("--max-gap", min=0.001, max=10, help="Truth is not interpolated over a longer gap [s].")
+]
+MaxAge = Annotated[float, typer.Option("--max-age", min=0.001, max=60, help="An output is current for this long [s].")]
+Reach = Annotated[
+    float, typer.Option("--reach", min=1, max=10_000, help="No output is expected beyond this range [m].")
+]
+
 
 @report_errors
 def evaluate_runs(
     runs: Annotated[list[Path], typer.Argument(help="Folders written by `grd run` or `grd replay`, or TUM files.")],
-    against: Annotated[
-        list[Path] | None, typer.Option("--against", help="A run to compare with, of the same recording; repeatable.")
-    ] = None,
+    against: Against = None,
     truth: Annotated[
         Path | None, typer.Option("--truth", help="TUM file of the true T_vehicle_drone [default: the run's own].")
     ] = None,
@@ -35,35 +61,14 @@ def evaluate_runs(
     no_drone: Annotated[
         bool, typer.Option("--no-drone", help="There was no drone: every output is a false alarm.")
     ] = False,
-    by: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--by",
-            metavar="FIELD",
-            help="Group by a field of the recordings' names (2 of SCENE-RANGE-...), by several (2,3) or by "
-            "configuration alone (config). Configurations are side by side in any case. Repeatable.",
-        ),
-    ] = None,
+    by: By = None,
     csv_file: Annotated[
         Path | None, typer.Option("--csv", help="CSV file of all metrics to write, a line a run.")
     ] = None,
-    tables_file: Annotated[
-        Path | None,
-        typer.Option(
-            "--paper-tables",
-            help="Markdown file to write: the paper's Tables I and II with the runs of recordings named "
-            "experiment_1 ... experiment_4-... next to them.",
-        ),
-    ] = None,
-    max_gap_s: Annotated[
-        float, typer.Option("--max-gap", min=0.001, max=10, help="Truth is not interpolated over a longer gap [s].")
-    ] = DEFAULTS.max_gap_s,
-    max_age_s: Annotated[
-        float, typer.Option("--max-age", min=0.001, max=60, help="An output is current for this long [s].")
-    ] = DEFAULTS.max_age_s,
-    reach_m: Annotated[
-        float, typer.Option("--reach", min=1, max=10_000, help="No output is expected beyond this range [m].")
-    ] = DEFAULTS.reach_m,
+    tables_file: TablesFile = None,
+    max_gap_s: MaxGap = DEFAULTS.max_gap_s,
+    max_age_s: MaxAge = DEFAULTS.max_age_s,
+    reach_m: Reach = DEFAULTS.reach_m,
 ) -> None:
     """Evaluate runs against truth.
 
@@ -74,9 +79,7 @@ def evaluate_runs(
 
     Example: grd evaluate out/street_sweep-replay --against out/street_sweep-paper --report out/compare.html
     """
-    missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
-    if missing:
-        raise LinkError(f"evaluating needs {' and '.join(missing)}, not installed: pip install -e '.[evaluate]'")
+    _check_installed()
     if no_drone and truth is not None:
         raise LinkError("--no-drone and --truth contradict each other: give one of them")
     from links.cli.evaluate_output import Files, compare_and_show, evaluate_all
@@ -90,3 +93,9 @@ def evaluate_runs(
     compare_and_show(own, others, keys, files)
     if any(e.findings for e in own):
         raise typer.Exit(EXIT_FAILED)
+
+
+def _check_installed() -> None:
+    missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
+    if missing:
+        raise LinkError(f"evaluating needs {' and '.join(missing)}, not installed: pip install -e '.[evaluate]'")

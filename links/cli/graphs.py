@@ -19,7 +19,7 @@ from flow.config.schema import schema as schema_of
 from flow.config_error import ConfigError
 from flow.graph import Graph, load_graph
 from links.cli.console import EXIT_FAILED, EXIT_USAGE, err, out, report_errors, warn
-from links.cli.run import Config, Overlay, Sets
+from links.cli.options import Config, Overlay, Sets
 from links.preflight.shipped_values import shipped_values
 from links.zenoh import host_graph
 

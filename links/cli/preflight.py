@@ -13,13 +13,14 @@ from rich.text import Text
 
 from flow.link import LinkError
 from links.cli.console import EXIT_FAILED, err, out, progress_bar, report_errors, warn
-from links.cli.run import Config, Overlay, Sets
+from links.cli.options import Config, HostName, HostsFile, Overlay, Sets, place_of
 from links.preflight.check_result import CheckResult, Level, is_go
 from links.preflight.hand_motion import HandMotion
 from links.preflight.preflight import OUT_DIR, preflight_live, preflight_recording
 from links.recording import Session
 from links.runs.live_run import live_graph
 from links.runs.request import RunRequest
+from links.zenoh import host_graph
 
 COLOURS = {Level.OK: "green", Level.WARNING: "yellow", Level.FAIL: "red"}
 LABELS = {Level.OK: "ok", Level.WARNING: "warn", Level.FAIL: "NO GO"}
@@ -48,19 +49,25 @@ def preflight(
     step_s: Annotated[
         float, typer.Option("--step", min=0.5, max=120, metavar="SECONDS", help="Time for each motion by hand.")
     ] = 6.0,
+    hosts: HostsFile = None,
+    host: HostName = None,
 ) -> None:
     """Check LiDAR, servo, cameras, autopilot, clocks, parameters, axes and disk; print GO or NO-GO.
 
     Live, the turntable is still at first; for the motions by hand it turns. Poses are not sent to the autopilot.
-    Warnings ("warn") are for you to assess. Exit code 0: go, 1: no go, 2: wrong use.
+    With --hosts run it on all hosts at the same time: the connections are checked too. Warnings ("warn") are for you to
+    assess. Exit code 0: go, 1: no go, 2: wrong use.
 
     Example: grd preflight configs/field.yaml --set lidar.bind=192.168.1.100 --set lidar.sender=192.168.1.201
     """
     request = RunRequest(config, tuple(overlay or ()), tuple(sets or ()))
+    place = place_of(hosts, host)
     if recording is None:
-        results = _print_results(
-            preflight_live(live_graph(request), for_s, _wait, _ask if motion else None, step_s, out_dir)
-        )
+        whole = live_graph(request)
+        graph = whole if place is None else host_graph(whole, *place, to_run=True)
+        results = _print_results(preflight_live(graph, for_s, _wait, _ask if motion else None, step_s, out_dir, whole))
+    elif place is not None:
+        raise LinkError("--hosts is for a live preflight, --recording for one on a recording: leave one of them out")
     else:
         results = _on_recording(request, recording, motion)
     failed = [v for v in results if v.level is Level.FAIL]

@@ -15,6 +15,7 @@ from flow.link import LinkError
 from flow.live.report import LiveReport
 from links.cli.console import EXIT_FAILED, err, out, progress_bar, report_errors, show_table, warn
 from links.cli.live_view import LiveView
+from links.cli.options import Config, HostName, HostsFile, Out, Overlay, Sets, View, place_of
 from links.cli.run_output import nothing_found, print_result
 from links.cli.side_by_side import side_by_side
 from links.preflight.shipped_values import shipped_values
@@ -24,25 +25,34 @@ from links.runs.output_hashes import hash_matches
 from links.runs.request import RunRequest, RunResult
 from links.runs.results import SUMMARY_FILE
 from links.runs.run_folder import replay_into
-from links.runs.shipped import CONFIGS, shipped, shipped_all, shipped_option
+from links.runs.shipped import CONFIGS, shipped, shipped_option
 from links.runs.warm_up import warm_up
 from links.zenoh import host_graph
 
 DEFAULT_REPLAY_CONFIG = CONFIGS / "replay.yaml"
 
-Config = Annotated[
-    Path,
-    typer.Argument(callback=shipped, help="Configuration; a name such as `quickstart` is one that comes with grd."),
+AsLive = Annotated[
+    bool,
+    typer.Option(
+        "--as-live",
+        help="Recording of a live run: re-run it with its own configuration, input order and drops, "
+        "and compare the output hash.",
+    ),
 ]
-Overlay = Annotated[
-    list[Path] | None,
-    typer.Option("--overlay", callback=shipped_all, help="YAML file laid over CONFIG; may be repeated."),
+Trust = Annotated[
+    bool,
+    typer.Option(
+        "--trust",
+        help="With --as-live: the recording is your own, so import its own stages and run its taps.",
+    ),
 ]
-Sets = Annotated[
-    list[str] | None, typer.Option("--set", metavar="NAME.SETTING=VALUE", help="Change one setting; may be repeated.")
+SingleProcess = Annotated[
+    bool,
+    typer.Option(
+        "--single-process",
+        help="Run in one process, even if the configuration places stages in subprocesses. The results are the same.",
+    ),
 ]
-Out = Annotated[Path | None, typer.Option("--out", help="Output folder [default: out/<recording>-<config>].")]
-View = Annotated[bool, typer.Option("--view", help="Open the run in the Rerun viewer at its end.")]
 
 
 @report_errors
@@ -61,10 +71,8 @@ def run(
             "--warm-up/--no-warm-up", help="Live: replay a recording first, so that all kernels are compiled."
         ),
     ] = True,
-    hosts: Annotated[
-        Path | None, typer.Option("--hosts", metavar="FILE", help="Live on several hosts: see links/zenoh/README.md.")
-    ] = None,
-    host: Annotated[str | None, typer.Option("--host", metavar="NAME", help="Name of this host in FILE.")] = None,
+    hosts: HostsFile = None,
+    host: HostName = None,
     against: Annotated[
         Path | None,
         typer.Option(
@@ -87,10 +95,9 @@ def run(
     if config.suffix == ".mcap":
         raise LinkError(f"{config} is a recording: grd replay {config}")
     recording = recording_named(config, overlay or (), sets or ())
-    if (hosts is None) is not (host is None):
-        raise LinkError("--hosts FILE and --host NAME go together: FILE places stages on hosts, NAME is this host")
+    place = place_of(hosts, host)
     if recording is not None:
-        if for_s is not None or hosts is not None:
+        if for_s is not None or place is not None:
             option = "--for" if for_s is not None else "--hosts"
             raise LinkError(f"{option} is for live runs, and {config} replays {recording.name}: leave it out")
         result = _run(recording, config, out_dir, overlay or [], sets or [], view)
@@ -101,7 +108,6 @@ def run(
     if against is not None:
         raise LinkError(f"--against is for a configuration that replays a recording, and {config} runs live")
     request = RunRequest(config, tuple(overlay or ()), tuple(sets or ()))
-    place = None if hosts is None or host is None else (hosts, host)
     _run_live(request, _new_folder(out_dir, f"live-{config.stem}"), for_s, warm, place, view)
 
 
@@ -118,29 +124,9 @@ def replay_recording(
     out_dir: Out = None,
     overlay: Overlay = None,
     sets: Sets = None,
-    as_live: Annotated[
-        bool,
-        typer.Option(
-            "--as-live",
-            help="Recording of a live run: re-run it with its own configuration, input order and drops, "
-            "and compare the output hash.",
-        ),
-    ] = False,
-    trust: Annotated[
-        bool,
-        typer.Option(
-            "--trust",
-            help="With --as-live: the recording is your own, so import its own stages and run its taps.",
-        ),
-    ] = False,
-    single_process: Annotated[
-        bool,
-        typer.Option(
-            "--single-process",
-            help="Run in one process, even if the configuration places stages in subprocesses. "
-            "The results are the same.",
-        ),
-    ] = False,
+    as_live: AsLive = False,
+    trust: Trust = False,
+    single_process: SingleProcess = False,
     hashed: Annotated[
         bool,
         typer.Option("--hash/--no-hash", help="Compute the output hash, an eighth of the time without cameras."),

@@ -1,4 +1,4 @@
-"""`grd simulate`, `grd matrix`: recordings of simulated flights; `grd flights`: their outcomes in closed loop.
+"""`grd simulate`: a recording of a simulated flight.
 
 Source: DESIGN, Command line.
 """
@@ -6,19 +6,14 @@ Source: DESIGN, Command line.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from flow.link import LinkError
-from links.cli.console import EXIT_FAILED, EXIT_USAGE, err, out, progress_bar, report_errors, warn
+from links.cli.console import out, progress_bar, report_errors
 from links.cli.files import Overwrite
-from links.runs.shipped import shipped, shipped_all, shipped_option
-from stages.geometry.lidar_models import LIDAR_MODELS
-
-if TYPE_CHECKING:  # the simulator is an optional dependency
-    from links.simulated.matrix.flights import Cell
-    from links.simulated.matrix.making import MatrixReport
+from links.runs.shipped import shipped, shipped_option
 
 ClosedLoop = Annotated[
     Path | None,
@@ -27,18 +22,6 @@ ClosedLoop = Annotated[
         metavar="CONFIG",
         callback=shipped_option,
         help="Configuration whose pipeline commands the servo.",
-    ),
-]
-
-JobsOption = Annotated[
-    int, typer.Option("--jobs", min=1, max=256, help="Number of processes; it does not affect the results.")
-]
-SchedulerOption = Annotated[
-    str | None,
-    typer.Option(
-        "--scheduler",
-        metavar="ADDRESS",
-        help="Run on the workers of a dask scheduler, as tcp://127.0.0.1:8786, with the same files at the same paths.",
     ),
 ]
 
@@ -80,7 +63,7 @@ def simulate_recording(
     try:
         from links.simulated.rig.run import simulate
     except ModuleNotFoundError as missing:
-        raise _not_installed(missing) from None
+        raise not_installed(missing) from None
 
     with progress_bar(f"simulate {scenario.name}") as step:
         report = simulate(
@@ -97,213 +80,6 @@ def simulate_recording(
     out.print(str(report), markup=False)
 
 
-@report_errors
-def simulate_matrix(
-    folder: Annotated[Path, typer.Argument(help="Folder for the recordings, one per cell and seed.")],
-    seeds: Annotated[int, typer.Option("--seeds", min=1, max=1000, help="Number of seeds per cell.")] = 1,
-    first_seed: Annotated[int, typer.Option("--first-seed", min=0, help="First seed.")] = 1,
-    only: Annotated[
-        list[str] | None,
-        typer.Option("--only", help="Cells whose name matches, as 'campus-*-orbit-parked'; may be repeated."),
-    ] = None,
-    pairs: Annotated[
-        bool, typer.Option("--pairs", help="Subset of cells that has any two of range, motion, vehicle and scene.")
-    ] = False,
-    closed_loop: ClosedLoop = None,
-    calibrated: Annotated[
-        bool, typer.Option("--calibrated", help="The rig file has the encoder's error and the backlash of the servo.")
-    ] = False,
-    perturbed: Annotated[
-        bool,
-        typer.Option(
-            "--perturbed", help="Each flight has a rig that differs from its file, and a random kind of drone."
-        ),
-    ] = False,
-    odometry: Annotated[bool, typer.Option("--odometry", help="The vehicle sends odometry.")] = False,
-    rain: Annotated[bool, typer.Option("--rain", help="Rain of 5 mm/h.")] = False,
-    sparse: Annotated[bool, typer.Option("--sparse", help="Fewer rays per LiDAR pulse, in half the time.")] = False,
-    varied_sky: Annotated[
-        bool,
-        typer.Option("--varied-sky", help="Gliding, circling and hovering birds, flocks, insects, kites, bags."),
-    ] = False,
-    clutter: Annotated[
-        bool,
-        typer.Option(
-            "--clutter",
-            help="Furniture, signs, boards, wires, people, reflections; cameras with rolling shutter, dirt and flare.",
-        ),
-    ] = False,
-    lidar: Annotated[
-        str, typer.Option("--lidar", metavar="MODEL", help="LiDAR of the rig, as `rig.lidar.model`: XT32, OS1-64, ...")
-    ] = "VLP-16",
-    autopilot: Annotated[
-        bool, typer.Option("--autopilot", help="The drone sends telemetry over a radio, and obeys flight dynamics.")
-    ] = False,
-    cameras_hz: Annotated[
-        float | None,
-        typer.Option(
-            "--cameras",
-            metavar="HZ",
-            min=1,
-            max=15,
-            help="Rate of two fisheyes; rendering a pair of 720 px images takes 0.8 s of a core.",
-        ),
-    ] = None,
-    cameras_px: Annotated[
-        int | None,
-        typer.Option("--pixels", min=64, max=1440, help="Size of the fisheye images. [default: 720]"),
-    ] = None,
-    readout_ms: Annotated[
-        float | None,
-        typer.Option("--readout", metavar="MS", min=0, max=60, help="Rolling shutter, first to last row. [default: 0]"),
-    ] = None,
-    images: Annotated[
-        Path | None,
-        typer.Option(
-            "--images",
-            metavar="DIR",
-            help="Use the images of the recordings of the same names in DIR. It is an error if one is missing or shows "
-            "another flight (the same command without --images then renders the rest).",
-        ),
-    ] = None,
-    results: Annotated[
-        Path | None,
-        typer.Option(
-            "--results",
-            metavar="OUT",
-            help="Keep the runs of the closed loop, as OUT/<recording>-<config>: the output of `grd replay --config "
-            "CONFIG` of each recording, without the second pass, without .rrd file. For `grd evaluate OUT/*`.",
-        ),
-    ] = None,
-    jobs: JobsOption = 1,
-    scheduler: SchedulerOption = None,
-    list_only: Annotated[bool, typer.Option("--list", help="Print the names of the cells and exit.")] = False,
-) -> None:
-    """Make the recordings of the scenario matrix.
-
-    Range x motion x vehicle x scene, an occlusion, and a drone that leaves and returns; also an empty sky, two drones,
-    a drone to search for at 40 m, and drones at 50 m. Existing recordings are kept if they are complete and made in the
-    same way (the same scenario, and the same CONFIG with its includes), so the command can be interrupted and repeated.
-    Changed code is not detected: use another DIR after a change. A recording that fails does not stop the others.
-    Exit code 1 when a scene does not allow a cell or a stage failed, 2 for any other failure.
-
-    Example: grd matrix out/matrix --only '*-empty-*' --closed-loop configs/sim.yaml --results out/runs --jobs 2
-    """
-    try:
-        from links.simulated.matrix.making import make_matrix
-        from links.simulated.matrix.matrix import Conditions
-    except ModuleNotFoundError as missing:
-        raise _not_installed(missing) from None
-
-    if results is not None and closed_loop is None:
-        raise LinkError("--results keeps the runs of a closed loop: add --closed-loop CONFIG")
-    of_cameras = {"--images": images, "--pixels": cameras_px, "--readout": readout_ms}
-    for option, value in of_cameras.items():
-        if value is not None and cameras_hz is None:
-            raise LinkError(f"{option} is for recordings with cameras: add --cameras HZ")
-    selected = _cells(folder, only or ["*"], pairs)
-    if list_only:
-        for cell in selected:
-            out.print(cell.name, markup=False)
-        return
-    size_px = cameras_px or Conditions.cameras_px
-    if lidar not in LIDAR_MODELS:
-        raise LinkError(f"--lidar {lidar}: not one of {', '.join(LIDAR_MODELS)}")
-    conditions = Conditions(
-        calibrated,
-        odometry,
-        rain,
-        autopilot,
-        cameras_hz,
-        size_px,
-        readout_ms or 0.0,
-        lidar,
-        perturbed,
-        sparse,
-        varied_sky,
-        clutter,
-    )
-    several = range(first_seed, first_seed + seeds)
-    with progress_bar(f"{len(selected) * seeds} recordings") as step:
-        report = make_matrix(
-            folder, selected, several, closed_loop, step, conditions, results, scheduler or jobs, images
-        )
-    _report(folder, report)
-
-
-def _cells(folder: Path, patterns: list[str], pairs: bool) -> list[Cell]:
-    """The cells whose name matches. LinkError when none does."""
-    from links.simulated.matrix.matrix import cells
-
-    selected = cells(patterns, pairs)
-    if not selected:
-        names = " or ".join(f"'{pattern}'" for pattern in patterns)
-        few = " among the pairs" if pairs else ""
-        raise LinkError(f"no cell{few} matches {names}; `grd matrix {folder} --list` prints all names")
-    return selected
-
-
-def _report(folder: Path, report: MatrixReport) -> None:
-    """Print the summary and exit with its code."""
-    for text in report.impossible:
-        warn(text)
-    for failure in report.failed:
-        err.print(failure.text, markup=False, style="red")
-    text = f"{folder}: {report.made} made, {report.kept} kept"
-    out.print(f"{text}; {report.replayed} of them replayed" if report.replayed else text, markup=False)
-    if any(not failure.stage_failed for failure in report.failed):
-        raise typer.Exit(EXIT_USAGE)
-    if report.impossible or report.failed:
-        raise typer.Exit(EXIT_FAILED)
-
-
-def _not_installed(missing: ModuleNotFoundError) -> LinkError:
+def not_installed(missing: ModuleNotFoundError) -> LinkError:
+    """The error for a command of the simulator without its extra."""
     return LinkError(f"simulating needs '{missing.name}', not installed: pip install -e '.[simulate]'")
-
-
-@report_errors
-def fly_scenarios(
-    scenarios: Annotated[
-        list[Path], typer.Argument(callback=shipped_all, help="Scenarios with an autopilot in the loop.")
-    ],
-    closed_loop: Annotated[
-        Path,
-        typer.Option(
-            "--closed-loop", metavar="CONFIG", callback=shipped, help="Configuration on whose poses the drone flies."
-        ),
-    ],
-    folder: Annotated[Path, typer.Option("--out", "-o", help="Folder for the outcomes and the table.")],
-    seeds: Annotated[int, typer.Option("--seeds", min=1, max=1000, help="Number of seeds per scenario.")] = 3,
-    first_seed: Annotated[int, typer.Option("--first-seed", min=0, help="First seed.")] = 1,
-    sets: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Change a setting of all scenarios; repeatable."),
-    ] = None,
-    jobs: JobsOption = 1,
-    scheduler: SchedulerOption = None,
-) -> None:
-    """Fly scenarios in closed loop and write a table: OUT/flights.md, and OUT/flights.csv with a line per flight.
-
-    Outcomes of the same scenario, settings, CONFIG and seed are kept, so the command can be interrupted and repeated.
-    Changed code is not detected: use another OUT after a change. Exit code 1 when a flight was lost or sent a wrong
-    pose.
-
-    Example: grd flights configs/scenarios/flight/matrix/*.yaml --closed-loop configs/sim_flight_fixes.yaml -o out/m
-    """
-    try:
-        from links.simulated.matrix.flight_runs import fly_all
-        from links.simulated.matrix.flight_table import markdown_table, write_csv
-    except ModuleNotFoundError as missing:
-        raise _not_installed(missing) from None
-
-    several = range(first_seed, first_seed + seeds)
-    with progress_bar(f"{len(scenarios) * seeds} flights") as step:
-        results = fly_all(scenarios, sets or (), closed_loop, several, folder, scheduler or jobs, step)
-    for result in results:
-        out.print(str(result), markup=False)
-    table = markdown_table(results)
-    (folder / "flights.md").write_text(table, encoding="utf-8")
-    write_csv(folder / "flights.csv", results)
-    out.print(table, markup=False)
-    if any(r.outcome is None or r.outcome["lost_s"] is not None or r.outcome["wrong_poses"] for r in results):
-        raise typer.Exit(EXIT_FAILED)

@@ -2,31 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 from flow.link import Link
 from links.camera.checks import CameraChecks
-from links.clock import Clock
+from links.clock.checks import ClockChecks
 from links.cues.checks import CuesChecks
 from links.dynamixel.checks import ServoChecks
 from links.lidar.checks import LidarChecks
 from links.mavlink.checks import AutopilotChecks
-from links.preflight.check_result import CheckResult
 from links.preflight.link_checks import LinkChecks
-from links.preflight.observations import Observations, ObservedSource
 from links.recording.checks import RecorderChecks
 from links.vehicle_odometry.checks import VehicleOdometryChecks
-
-
-class ClockChecks(LinkChecks):
-    """The host's clock needs no check: it is not a device."""
-
-    link_class = Clock
-
-    def check_source(self, source: ObservedSource, observations: Observations) -> Iterator[CheckResult]:
-        """No results."""
-        yield from ()
-
+from links.zenoh.checks import ReceiverChecks, SenderChecks
 
 DEVICES: tuple[LinkChecks, ...] = (
     LidarChecks(),
@@ -36,6 +22,8 @@ DEVICES: tuple[LinkChecks, ...] = (
     VehicleOdometryChecks(),
     CuesChecks(),
     ClockChecks(),
+    ReceiverChecks(),
+    SenderChecks(),
     RecorderChecks(),
 )
 _UNKNOWN = LinkChecks()

@@ -27,16 +27,23 @@ Ask = Callable[[HandMotion], None]  # shows a person what to do and returns when
 
 
 def preflight_live(
-    graph: Graph, seconds: float, wait: Wait, ask: Ask | None, step_s: float = 6.0, out_dir: Path = OUT_DIR
+    graph: Graph,
+    seconds: float,
+    wait: Wait,
+    ask: Ask | None,
+    step_s: float = 6.0,
+    out_dir: Path = OUT_DIR,
+    whole: Graph | None = None,
 ) -> Iterator[CheckResult]:
     """Check live hardware; yields each result as soon as it is known. Raises LinkError if the simulated rig fails.
 
     First the sources alone run for `seconds`. Then the devices are asked (autopilot parameters, free disk space at
     `out_dir`). Then the drone is moved by hand while the LiDAR tracks it, unless `ask` is None.
+    `whole`: the graph of all hosts, if `graph` is the part of one; what the configuration lacks is judged by it.
     """
     with simulated_rig(graph):
         observations = collect_live(sources_only(graph), lambda _: wait(seconds))
-        yield from link_checks(graph, observations, out_dir)
+        yield from link_checks(graph, observations, out_dir, whole)
         if not _has_attitude(observations):
             return
         if ask is None:
@@ -63,11 +70,13 @@ def preflight_recording(
         yield warning("axes", "skipped (--no-motion): not checked")
 
 
-def link_checks(graph: Graph, observations: Observations, out_dir: Path) -> Iterator[CheckResult]:
-    """Results of every link that the configuration declares, and of those that it lacks."""
+def link_checks(
+    graph: Graph, observations: Observations, out_dir: Path, whole: Graph | None = None
+) -> Iterator[CheckResult]:
+    """Results of every link of `graph`, and of those that the configuration (`whole`, or else `graph`) lacks."""
     for source in observations.sources:
         yield from checks_for(source.link).check_source(source, observations)
-    yield from configuration_checks(graph)
+    yield from configuration_checks(whole or graph)
     for checks in DEVICES:
         yield from checks.check_device(graph, observations, out_dir)
 

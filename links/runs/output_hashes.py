@@ -24,8 +24,8 @@ from flow.taps import Digest
 from links.recording import Session
 
 HASHES_FILE = "hashes.json"
-CONFIGS = ("paper", "estimate")  # of configs/; pinned for every recording
-LIDAR_CONFIGS, CAMERA_CONFIGS = ("replay",), ("vision",)  # also pinned for recordings without cameras, and with them
+CONFIGS = ("replay", "paper", "estimate")  # of configs/; pinned for every recording
+CAMERA_CONFIGS = ("vision",)  # also pinned for recordings with cameras
 HASH_FORM = "16 hex digits, a dash and 16 hex digits"
 
 
@@ -82,7 +82,7 @@ def read_pins(folder: Path, configs: Path, only: tuple[str, ...] = ()) -> list[P
         Pin(file, configs / f"{name}.yaml", pinned.get(file.name, {}).get(name))
         for file in recordings
         if not only or file.stem in only
-        for name in (*CONFIGS, *(CAMERA_CONFIGS if _has_cameras(file) else LIDAR_CONFIGS))
+        for name in (*CONFIGS, *(CAMERA_CONFIGS if _has_cameras(file) else ()))
     ]
 
 

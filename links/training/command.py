@@ -54,10 +54,8 @@ def train_detector(
 
     Example: grd train-detector out/train/* -o configs/models/detector.yaml --held-out out/held_out
     """
-    import yaml
-
     from links.training.candidates import lidar_model_of, read_candidates
-    from links.training.fit import STRENGTHS, predicted, train
+    from links.training.fit import predicted, train
     from stages.detect.trained.features import FEATURES, GROUPS
 
     if ablation and not held_out:
@@ -75,12 +73,7 @@ def train_detector(
     }
     start = None if start_file is None else _read_model(start_file)
     model = train(rows, trained, left_out or [], lidar_model, start)
-    if trained["strength"] in (STRENGTHS[0], STRENGTHS[-1]):
-        err.print(
-            f"warning: the best strength of the penalty, {trained['strength']:g}, is at an end of those tried "
-            f"({STRENGTHS[0]:g} to {STRENGTHS[-1]:g}): another one may be better",
-            markup=False,
-        )
+    _warn_of_end(trained["strength"])
     if folders:
         unseen = read_candidates(folders)
         trained["held_out"] = _compared(unseen, predicted(model, unseen))
@@ -89,11 +82,30 @@ def train_detector(
             less = train(rows, {}, [*(left_out or []), *names], lidar_model, start, [trained["strength"]])
             trained.setdefault("ablation", {})[group] = _ablated(group, unseen, predicted(less, unseen))
         model = model.model_copy(update={"trained": trained})
+    _write_model(model, out_file)
+    out.print(f"{out_file}: {len(rows.X)} rows of {len(runs)} runs", markup=False)
+
+
+def _warn_of_end(strength: float) -> None:
+    """Warn when the best penalty is the smallest or the largest that was tried."""
+    from links.training.fit import STRENGTHS
+
+    if strength in (STRENGTHS[0], STRENGTHS[-1]):
+        err.print(
+            f"warning: the best strength of the penalty, {strength:g}, is at an end of those tried "
+            f"({STRENGTHS[0]:g} to {STRENGTHS[-1]:g}): another one may be better",
+            markup=False,
+        )
+
+
+def _write_model(model: DetectorModel, file: Path) -> None:
+    """Write a weights file: an overlay of the detector's settings."""
+    import yaml
+
     text = yaml.safe_dump(
         {"stages": {"detect": {"config": {"model": model.model_dump(mode="json")}}}}, sort_keys=False, width=2000
     )
-    out_file.write_text(f"# The detector's model, written by `grd train-detector`.\n{text}", encoding="utf-8")
-    out.print(f"{out_file}: {len(rows.X)} rows of {len(runs)} runs", markup=False)
+    file.write_text(f"# The detector's model, written by `grd train-detector`.\n{text}", encoding="utf-8")
 
 
 def _read_model(file: Path) -> DetectorModel:

@@ -13,6 +13,7 @@ from typing import NamedTuple
 from links.clock.device_clock import DeviceClock
 
 MAX_UNCERTAINTY_NS = 25_000_000
+CLOCK_OFFSET, CLOCK_UNCERTAINTY = "clock offset [us]", "clock uncertainty [us]"  # counters
 
 
 class ClockOffset(NamedTuple):
@@ -57,6 +58,18 @@ class PeerClock:
         """The present offset; None before the first reply."""
         with self._lock:
             return self._offset()
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """The present offset, the bound of its error, and restarts; empty before the first reply."""
+        offset = self.offset
+        if offset is None:
+            return {}
+        return {
+            CLOCK_OFFSET: offset.offset_ns // 1000,
+            CLOCK_UNCERTAINTY: offset.uncertainty_ns // 1000,
+            "peer restarts": self.restarts,
+        }
 
     def _offset(self) -> ClockOffset | None:
         offset_ns, uncertainty_ns = self._clock.offset_ns, self._clock.uncertainty_ns

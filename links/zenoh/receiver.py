@@ -152,12 +152,7 @@ class Receiver(link.Source[ReceiverSettings]):
     def counters(self) -> dict[str, int]:
         """Totals since the start, and the clock offset (local - peer) with the bound of its error."""
         counts = {name: self._counts[name] for name in COUNTED}
-        offset = None if self._clock is None else self._clock.offset
-        if self._clock is not None and offset is not None:
-            counts["clock offset [us]"] = offset.offset_ns // 1000
-            counts["clock uncertainty [us]"] = offset.uncertainty_ns // 1000
-            counts["peer restarts"] = self._clock.restarts
-        return counts
+        return counts if self._clock is None else counts | self._clock.counters
 
     @property
     def status(self) -> str | None:

@@ -13,6 +13,7 @@ from flow.link import Record, SourceSettings
 from flow.message import Message
 from links.zenoh.connection import ZenohConnection, connected
 from links.zenoh.output_queue import OutputQueue
+from links.zenoh.peer_clock import PeerClock
 from links.zenoh.session_settings import SessionSettings, key_of
 
 JOIN_S = 0.2  # limit of waiting for the threads; a blocked one ends later
@@ -37,6 +38,7 @@ class Sender(link.Source[SenderSettings]):
         super().__init__(settings, **values)
         self._queues: dict[str, OutputQueue] = {}
         self._connection: ZenohConnection | None = None
+        self._clock: PeerClock | None = None
         self._unopened: int = 0
         for hop in self.hops:
             deadline_ns = round(hop.queue.deadline_ms * 1e6)
@@ -57,7 +59,7 @@ class Sender(link.Source[SenderSettings]):
         """Connect to the other host. Raises LinkError when a certificate or the library is missing."""
         closing = threading.Event()
         with connected(self.settings.session) as connection:
-            self._connection = connection
+            self._connection, self._clock = connection, connection.clocks[self.settings.to]
             threads = [
                 threading.Thread(target=queue.run, args=(connection, closing), name=f"send {queue.key}", daemon=True)
                 for queue in self._queues.values()
@@ -74,7 +76,10 @@ class Sender(link.Source[SenderSettings]):
 
     @property
     def counters(self) -> dict[str, int]:
-        """Totals since the start over all outputs; dropped, late and failed by output, too, where there were any."""
+        """Totals since the start over all outputs, and the clock offset (local - peer) with the bound of its error.
+
+        Dropped, late and failed by output, too, where there were any.
+        """
         counts = {queue.key.split("/", 3)[3].replace("/", "."): queue.counts for queue in self._queues.values()}
         totals = {
             "sent": sum(c.sent for c in counts.values()),
@@ -85,7 +90,7 @@ class Sender(link.Source[SenderSettings]):
             numbers = {name: getattr(c, what) for name, c in counts.items()}
             totals[what] = sum(numbers.values())
             totals |= {f"{what}: {name}": number for name, number in numbers.items() if number}
-        return totals
+        return totals if self._clock is None else totals | self._clock.counters
 
     @property
     def status(self) -> str | None:

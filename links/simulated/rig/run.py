@@ -93,7 +93,6 @@ class Simulation:
         self._loop, self._record_truth = loop, record_truth
         self.scenario = scenario if seed is None else scenario.changed(seed=seed)
         self.seed = self.scenario.seed
-        drone = scenario.drone
         start_ns, duration_s = scenario.start_ns, scenario.duration_s
         self.telemetry_sources: list[Autopilot | FlightStack | VehicleOdometry | RotationSensor | CueSensors] = []
         self.flight: FlightInTheLoop | None = None
@@ -106,12 +105,10 @@ class Simulation:
             self.telemetry_sources.append(odometry)
         if (cues := cue_sensors(self.scenario, vehicle_motion, drone_motion)) is not None:
             self.telemetry_sources.append(cues)
-        others = scenario.other_drones
-        self.truth = Truth(start_ns, vehicle_motion, drone_motion, tuple(other.path for other in others))
+        others = tuple(other.path for other in scenario.other_drones)
+        self.truth = Truth(start_ns, vehicle_motion, drone_motion, others)
         self._scene = _scene(self.scenario, self.truth)
-        spans_m = [flying.span_m for flying in (drone, *others) if flying is not None]
-        planned = self.truth if self.flight is None else dataclasses.replace(self.truth, drone=drone and drone.path)
-        check_paths(self._scene.world, planned, scenario.duration_s, spans_m)
+        self._check_paths()
         if self.flight is not None:
             self.flight.watch(self._scene.world, self.truth)
         fixes = scenario.fix_sensor
@@ -123,7 +120,7 @@ class Simulation:
         self._lidar = Lidar(scenario.lidar, scenario.start_ns, self.seed, scenario.weather, form)
         self.encoder = PacketEncoder(unit, scenario.lidar.return_mode)
         script = scenario.script if loop is None else ()
-        commander = ServoScript(script, self.drone_servo_rad if drone else None, self.seed)
+        commander = ServoScript(script, self.drone_servo_rad if scenario.drone else None, self.seed)
         shift_ns = round(scenario.mount.servo_time_offset_s * 1e9)
         self._servo = ServoBus(scenario.servo, commander, scenario.start_ns, shift_ns, self.seed)
         self._arrival = np.random.default_rng([self.seed, 5])
@@ -138,6 +135,13 @@ class Simulation:
         self.pulses = 0
         self.returns = 0
         self.drone_return_ns: list[int] = []  # truth, for statistics: times of returns from drones
+
+    def _check_paths(self) -> None:
+        """Raise LinkError for a planned path that meets the scene."""
+        drone, others = self.scenario.drone, self.scenario.other_drones
+        spans_m = [flying.span_m for flying in (drone, *others) if flying is not None]
+        planned = self.truth if self.flight is None else dataclasses.replace(self.truth, drone=drone and drone.path)
+        check_paths(self._scene.world, planned, self.scenario.duration_s, spans_m)
 
     def _drone_motion(self, odometry: VehicleOdometry | None) -> Path | Flight | FlownMotion | None:
         """The drone's motion: its path, a flight along it, or that of an autopilot in the loop. Adds the autopilot."""

@@ -16,7 +16,7 @@ from rich.text import Text
 
 from flow.link import LinkError
 from links.cli.console import EXIT_FAILED, check_new, err, out, progress_bar, report_errors, show_table, warn
-from links.cli.files import read_rig
+from links.cli.files import Overwrite, read_rig
 
 if TYPE_CHECKING:  # scipy and numba are imported when the command runs
     from links.calibration import Gathered
@@ -25,6 +25,27 @@ if TYPE_CHECKING:  # scipy and numba are imported when the command runs
 ROUNDING_DEG = 1e-6
 STILL_M = 0.05  # motion by the vehicle's odometry below which it stood still
 DRIFT_MPS = 0.02  # allowed drift of the odometry; the surfaces decide then
+
+LevelDeg = Annotated[
+    float | None,
+    typer.Option(
+        "--level",
+        min=0.02,
+        max=1.0,
+        metavar="DEG",
+        help="The vehicle stands level on the ground about it, within DEG (one sigma): gives the axis's tilt.",
+    ),
+]
+ParallelDeg = Annotated[
+    float | None,
+    typer.Option(
+        "--parallel",
+        min=0.02,
+        max=1.0,
+        metavar="DEG",
+        help="The vehicle stands parallel to a wall at its side, within DEG (one sigma): gives the servo's zero.",
+    ),
+]
 
 
 @report_errors
@@ -41,31 +62,13 @@ def calibrate_recording(
     parked: Annotated[
         bool, typer.Option("--parked", help="The vehicle stood still: for a servo that swept one way only.")
     ] = False,
-    level_deg: Annotated[
-        float | None,
-        typer.Option(
-            "--level",
-            min=0.02,
-            max=1.0,
-            metavar="DEG",
-            help="The vehicle stands level on the ground about it, within DEG (one sigma): gives the axis's tilt.",
-        ),
-    ] = None,
-    parallel_deg: Annotated[
-        float | None,
-        typer.Option(
-            "--parallel",
-            min=0.02,
-            max=1.0,
-            metavar="DEG",
-            help="The vehicle stands parallel to a wall at its side, within DEG (one sigma): gives the servo's zero.",
-        ),
-    ] = None,
+    level_deg: LevelDeg = None,
+    parallel_deg: ParallelDeg = None,
     from_s: Annotated[float, typer.Option("--from", min=0, help="Second of RECORDING to begin at.")] = 0.0,
     to_s: Annotated[
         float | None, typer.Option("--to", min=0, help="Second of RECORDING to end at [default: its end].")
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing output files.")] = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Estimate the LiDAR's mount on its servo, from surfaces that a sweep of RECORDING observes more than once.
 
@@ -87,8 +90,7 @@ def calibrate_recording(
     target = out_file or recording.with_suffix(".rig.yaml")
     if target.suffix not in (".yaml", ".yml"):
         raise LinkError(f"{target}: a rig file ends in .yaml")
-    figures = target.with_suffix(".svg")
-    for file in (target, figures):
+    for file in (target, target.with_suffix(".svg")):
         check_new(file, "--out", overwrite=overwrite)
     if to_s is not None and to_s <= from_s:
         raise LinkError(f"--to {to_s:g} is not after --from {from_s:g}")
@@ -106,6 +108,11 @@ def calibrate_recording(
     _report(recording.name, found, gathered)
     target.write_text(rig_text(gathered.rig, found, recording.name), encoding="utf-8")
     out.print(f"rig         {target}   (use it: grd replay RECORDING --overlay {target})", markup=False)
+    _draw(found, target.with_suffix(".svg"))
+
+
+def _draw(found: Calibration, figures: Path) -> None:
+    """Write the figures, where matplotlib is installed."""
     if importlib.util.find_spec("matplotlib") is None:
         out.print("figures     none: matplotlib is not installed: pip install -e '.[evaluate]'", markup=False)
         return

@@ -104,7 +104,7 @@ TEXTS = {  # source file and its texts
         "the autopilot no longer replies to TIMESYNC",
     ],
     "links/mavlink/transport/signing.py": ["the signing time cannot be written"],
-    "links/vehicle_odometry/udp.py": ["age_s invalid or too large"],
+    "links/udp/datagrams.py": ["age_s invalid or too large"],
     "links/viewer/viewer.py": ["not all is drawn", "not drawn"],
     "links/zenoh/connection.py": ["does not accept the connection", "has not replied for"],
     "links/zenoh/sender.py": ["does not subscribe to"],

@@ -12,7 +12,7 @@ from links.cues.cues import Cues
 from links.preflight.check_result import CheckResult, ok, warning
 from links.preflight.link_checks import LinkChecks
 from links.preflight.observations import Observations, ObservedSource
-from links.vehicle_odometry.udp import MAX_AGE_S, WRONG_AGE
+from links.udp import MAX_AGE_S, WRONG_AGE
 
 
 class CuesChecks(LinkChecks):

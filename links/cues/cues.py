@@ -11,34 +11,24 @@ import dataclasses
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
-from ipaddress import IPv4Address
-from typing import Any
-
-from pydantic import Field, model_validator
+from typing import Any, ClassVar
 
 from flow.counters import Counters
-from flow.link import LinkError, Record, Source, SourceSettings
+from flow.link import Record, Source
 from links.cues.parsing import CueParser
-from links.vehicle_odometry.udp import listen_udp
+from links.udp import UdpSettings, listen_udp
 from stages.messages import DroneGnss, UwbRange, VehicleGnss
 
 NMEA_SUFFIX = "/nmea"  # topic of NMEA datagrams: a recording declares one encoding per topic
 MAX_REASONS = 20  # of rejections, counted each
 
 
-class CuesSettings(SourceSettings):
+class CuesSettings(UdpSettings):
     """Settings of `Cues`."""
 
-    topic: str = "/cues"
-    port: int | None = Field(None, ge=1, le=65535)  # UDP, live; None: no live cues
-    bind: IPv4Address = IPv4Address("127.0.0.1")  # this host's address
-    sender: IPv4Address | None = None  # the sender's address; others are ignored
+    what: ClassVar[str] = "cues"
 
-    @model_validator(mode="after")
-    def _sender_is_known(self) -> CuesSettings:
-        if self.sender is None and not self.bind.is_loopback:
-            raise ValueError(f"sender: set the cues' sender when binding to {self.bind}, so that others are ignored")
-        return self
+    topic: str = "/cues"
 
 
 class Cues(Source[CuesSettings]):
@@ -64,11 +54,7 @@ class Cues(Source[CuesSettings]):
     @contextmanager
     def listen(self) -> Iterator[Iterator[Record]]:
         """Receive cues: `with cues.listen() as records`. LinkError without `port`, or when it cannot be opened."""
-        settings = self.settings
-        if settings.port is None:
-            raise LinkError(f"{settings.topic}: set `port` to receive cues, or remove the link")
-        sender = None if settings.sender is None else str(settings.sender)
-        with listen_udp(settings.topic, str(settings.bind), settings.port, sender, self._udp, "cues") as records:
+        with listen_udp(self.settings, self._udp) as records:
             yield (_on_its_topic(record) for record in records)
 
     def decode(self, record: Record) -> Iterator[VehicleGnss | DroneGnss | UwbRange]:

@@ -6,7 +6,7 @@
     {"uwb_range": {"range_m"}}                                          optional: "sigma_m"
     $GNGGA,... and $GNHDT,...                          position and heading of the vehicle
 
-Beside them `age_s`, as for the vehicle's odometry. NMEA's altitude is that above mean sea level, as MAVLink's is.
+Also `age_s`, as for the vehicle's odometry. NMEA's altitude is that above mean sea level, as MAVLink's is.
 
 Source: recordings/README.md (/cues); NMEA 0183 as in https://gpsd.gitlab.io/gpsd/NMEA.html (GGA, HDT, checksum).
 """

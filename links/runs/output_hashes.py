@@ -91,7 +91,7 @@ def write_pins(folder: Path, outcomes: list[PinResult]) -> None:
     pinned = _read(folder / HASHES_FILE)
     for outcome in outcomes:
         pinned.setdefault(outcome.pin.recording.name, {})[outcome.pin.config.stem] = outcome.actual
-    text = json.dumps({name: pinned[name] for name in sorted(pinned)}, indent=2)
+    text = json.dumps(pinned, indent=2, sort_keys=True)
     (folder / HASHES_FILE).write_text(text + "\n", encoding="utf-8")
 
 

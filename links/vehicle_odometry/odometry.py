@@ -1,4 +1,6 @@
-"""The vehicle's own odometry as a source: one JSON object per pose, T_map_vehicle; live by UDP (`udp.py`).
+"""The vehicle's own odometry as a source: one JSON object per pose, T_map_vehicle; live by UDP (`links.udp`).
+
+    {"xyz_m": [x, y, z], "quaternion_xyzw": [x, y, z, w], "covariance": [36 numbers] or null, "age_s": 0.004}
 
 A recording without it is no error: the source has no records, and the run reports that once.
 
@@ -12,15 +14,13 @@ import math
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
-from ipaddress import IPv4Address
 from typing import Any, ClassVar
 
 import numpy as np
-from pydantic import Field, model_validator
 
 from flow.counters import Counters
-from flow.link import LinkError, Record, Source, SourceSettings
-from links.vehicle_odometry.udp import listen_udp
+from flow.link import Record, Source
+from links.udp import UdpSettings, listen_udp
 from stages.geometry.frames import Array64, rotation_from_quaternion_xyzw
 from stages.messages import VehicleMotion
 
@@ -30,21 +30,12 @@ NORM_TOLERANCE = 1e-3  # of a quaternion
 CORRELATION_TOLERANCE = 1e-4  # effect of rounding a covariance to six digits
 
 
-class VehicleOdometrySettings(SourceSettings):
+class VehicleOdometrySettings(UdpSettings):
     """Settings of `VehicleOdometry`."""
 
-    topic: str = "/vehicle/odometry"
-    port: int | None = Field(None, ge=1, le=65535)  # UDP, live; None: no live odometry
-    bind: IPv4Address = IPv4Address("127.0.0.1")  # this host's address
-    sender: IPv4Address | None = None  # the sender's address; others are ignored
+    what: ClassVar[str] = "the vehicle's odometry"
 
-    @model_validator(mode="after")
-    def _sender_is_known(self) -> VehicleOdometrySettings:
-        if self.sender is None and not self.bind.is_loopback:
-            raise ValueError(
-                f"sender: set the odometry's sender when binding to {self.bind}, so that others are ignored"
-            )
-        return self
+    topic: str = "/vehicle/odometry"
 
 
 class VehicleOdometry(Source[VehicleOdometrySettings]):
@@ -69,11 +60,7 @@ class VehicleOdometry(Source[VehicleOdometrySettings]):
 
     def listen(self) -> AbstractContextManager[Iterator[Record]]:
         """Receive poses: `with odometry.listen() as records`. LinkError without `port`, or when it cannot be opened."""
-        settings = self.settings
-        if settings.port is None:
-            raise LinkError(f"{settings.topic}: set `port` to receive the vehicle's odometry, or remove the link")
-        sender = None if settings.sender is None else str(settings.sender)
-        return listen_udp(settings.topic, str(settings.bind), settings.port, sender, self._udp)
+        return listen_udp(self.settings, self._udp)
 
     def decode(self, record: Record) -> VehicleMotion | None:
         """The pose in `{"xyz_m": [...], "quaternion_xyzw": [...], "covariance": [36] or null}`; None: invalid."""

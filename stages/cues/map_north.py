@@ -7,7 +7,7 @@ The slow error of GNSS cancels in a displacement; what is left is noise: sigma =
 precise of the two is used. Headings do not average: the error of a compass or of an antenna baseline is constant. The
 odometry's yaw drifts after a measurement: sigma grows with its age, and after KEPT_NS it is not used.
 
-Source: ours.
+Source: ours. KEPT_NS, LEAST_BASELINE_M and SCALE are chosen; the drift is an assumption about the vehicle's odometry.
 """
 
 from __future__ import annotations

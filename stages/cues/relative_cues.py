@@ -11,7 +11,8 @@ of GNSS is that of one receiver; those of drone and vehicle add up. The autopilo
 cannot contain a pose that grd sent (`IndependentTelemetry`); a receiver's own position never contains one.
 
 Source: ours. GNSS of a logged Pixhawk flight: 2.9 m off horizontally (median), nearly constant over 188 s: 2.5 m an
-axis (a Rayleigh distribution's median is 1.18 sigma).
+axis (a Rayleigh distribution's median is 1.18 sigma). Ranging noise: DW1000 data sheet. Latencies, the other noises and
+biases, and the limits below are ours, chosen, not measured: set those of your receivers.
 """
 
 from __future__ import annotations

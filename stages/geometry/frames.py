@@ -23,6 +23,7 @@ Source: DESIGN, Frames; REP-105; VLP-16 user manual 63-9243, section 9 (lidar ax
 from __future__ import annotations
 
 import math
+import operator
 from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
@@ -142,10 +143,6 @@ class Harmonic(_Settings):
 UNCALIBRATED_DEG = 0.3  # MX-28 without calibration: encoder error, half the gear play, zero set by eye
 
 
-def _is_zero(value: float) -> bool:
-    return value == 0.0
-
-
 def _is_uncalibrated(value: float) -> bool:
     return value == UNCALIBRATED_DEG
 
@@ -167,7 +164,7 @@ class LidarMount(_Settings):
     servo_zero_deg: float = 0.0
     servo_time_offset_s: Annotated[float, Field(ge=-0.5, le=0.5)] = 0.0
     servo_harmonics: tuple[Harmonic, ...] = ()
-    servo_play_deg: Annotated[float, Field(ge=0, le=5, exclude_if=_is_zero)] = 0.0
+    servo_play_deg: Annotated[float, Field(ge=0, le=5, exclude_if=operator.not_)] = 0.0
     pointing_sigma_deg: Annotated[float, Field(ge=0, le=5, exclude_if=_is_uncalibrated)] = UNCALIBRATED_DEG
 
     def turntable_rad(self, servo_rad: Angle) -> Angle:

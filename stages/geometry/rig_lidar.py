@@ -6,6 +6,7 @@ Source: ours.
 from __future__ import annotations
 
 import math
+import operator
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -14,10 +15,6 @@ from stages.geometry.frames import LidarMount
 from stages.geometry.lidar_models import LidarModel, LidarProfile, lidar_profile
 
 OusterProfile = Literal["LEGACY", "RNG19_RFL8_SIG16_NIR16", "RNG15_RFL8_NIR8", "RNG19_RFL8_SIG16_NIR16_DUAL"]
-
-
-def _is_none(value: object) -> bool:
-    return value is None  # rig files leave out what they do not use
 
 
 class LidarBeams(BaseModel):
@@ -32,7 +29,7 @@ class LidarBeams(BaseModel):
     spin_hz: Literal[10, 20] = 10  # Ouster
     columns_per_packet: Annotated[int, Field(ge=1, le=128)] = 16  # Ouster
     packets: OusterProfile = "LEGACY"  # Ouster: udp_profile_lidar
-    serial: Annotated[int | None, Field(exclude_if=_is_none)] = (
+    serial: Annotated[int | None, Field(exclude_if=operator.not_)] = (
         None  # packets of another unit are refused; None: not checked
     )
 
@@ -44,7 +41,7 @@ class RigLidar(BaseModel):
 
     model: LidarModel = "VLP-16"
     mount: LidarMount = LidarMount()
-    beams: Annotated[LidarBeams | None, Field(exclude_if=_is_none)] = None
+    beams: Annotated[LidarBeams | None, Field(exclude_if=operator.not_)] = None
 
     @model_validator(mode="after")
     def _beams_fit(self) -> RigLidar:

@@ -70,7 +70,8 @@ class PaperVpSettings(Settings):
     min_length_px: float = Field(20.0, ge=5)
     max_lines: int = Field(200, ge=2, le=1000)  # the longest of each view
     vote: Literal["sphere", "image"] = "sphere"
-    cells: int = Field(90, ge=10, le=360)  # of the grid, per 90 deg of the sphere or side of a view
+    sphere_cells: int = Field(90, ge=10, le=360)  # of the grid per 90 deg, by `sphere`
+    image_cells: int = Field(90, ge=10, le=360)  # of the grid per side of a view, by `image`
     min_lines: int = Field(10, ge=2)  # within 2 deg of a view's vanishing point; with fewer the view has none
     apart_deg: float = Field(20.0, ge=0, lt=45)  # between the points of the views by `sphere`; 0: independent views
     min_angle_deg: float = Field(80.0, gt=5, lt=90)  # between the two selected vanishing points
@@ -142,11 +143,11 @@ class PaperVp(Stage[PaperVpSettings]):
         """Direction (3,) with the most votes of a view's lines, and its share of all votes; share 0: none."""
         settings = self.settings
         if settings.vote == "image":
-            u, v, share = fullest_in_image(*vote_in_image(segments, settings.view_px, settings.cells))
+            u, v, share = fullest_in_image(*vote_in_image(segments, settings.view_px, settings.image_cells))
             return view.directions(np.array([[u, v]]))[0], share
         angles = np.arctan2(segments[:, 3] - segments[:, 1], segments[:, 2] - segments[:, 0])
         lengths, others = segment_length_px(segments), np.array(taken).reshape(-1, 3)
-        return fullest(*vote(normal, lengths, angles, settings.cells, others, math.radians(settings.apart_deg)))
+        return fullest(*vote(normal, lengths, angles, settings.sphere_cells, others, math.radians(settings.apart_deg)))
 
     def _message(
         self, stamp_ns: int, lines: list[_Lines], directions: Array64 | None, reason: str

@@ -3,8 +3,8 @@
     python -m pytest tests/benchmarks/bench_lidar.py --benchmark-columns=min,median,iqr,rounds
 
 Times are per 1000 packets: 1 ms is 1 us per packet. What each row does:
-- ours, whole decode: bytes to `LidarFirings` (fresh arrays, int64 times, every pulse), checks, clock, counters.
-- ours, kernel: arrays are there already.
+- grd, whole decode: bytes to `LidarFirings` (fresh arrays, int64 times, every pulse), checks, clock, counters.
+- grd, kernel: arrays are there already.
 - theirs, stream: bytes to points, their per-packet API; returns only, float32 times, a cloud per turn.
 - theirs, packet objects: one packet per call; in the second row the bytes were copied into their objects before.
 - theirs, capture: their whole-file API, with reading the pcap (dpkt) in it.
@@ -65,15 +65,15 @@ def their_packet(record):
     return velodyne_decoder.PacketVector([velodyne_decoder.VelodynePacket(1e-9 * record.stamp_ns, record.data)])
 
 
-def test_ours_whole_decode(benchmark, records):
+def test_grd_whole_decode(benchmark, records):
     benchmark(decode_all, records)
 
 
-def test_ours_whole_decode_dual(benchmark, records):
+def test_grd_whole_decode_dual(benchmark, records):
     benchmark(decode_all, dual(records))
 
 
-def test_ours_kernel(benchmark, records):
+def test_grd_kernel(benchmark, records):
     sizes = (np.int64, np.uint8, np.float32, np.float32, np.uint8, np.uint8)
     form = packet_format("VLP-16")
     arrays = [np.empty(form.max_rows, dtype) for dtype in sizes]

@@ -1,9 +1,9 @@
-"""Draw docs/images/reliability.png: stated against actual errors of vanishing directions, simulated beside real.
+"""Draw docs/images/reliability.png: stated against actual errors of vanishing directions, simulated and real side by side.
 
     python -m tests.benchmarks.draw_reliability [IMAGES_PER_CAMERA]
 
 Needs the extras `evaluate` and `simulate`. The real half needs ../shared/data (panoramas, York Urban, corridor) and is
-empty without it. Prints one line per group; writes pictures of simulated failures to docs/images/vp_failure_*.jpg.
+empty without it. Prints one line per group; writes images of simulated failures to docs/images/vp_failure_*.jpg.
 """
 
 from __future__ import annotations
@@ -17,21 +17,19 @@ import matplotlib
 import numpy as np
 from matplotlib import pyplot as plt
 
-from stages.geometry.frames import Pose
 from stages.geometry.lens_files import lens_from_ocamcalib
 from stages.messages import CameraMount, Image
 from stages.vp import GreatCircleVp
-from tests.benchmarks.bench_vp import R_MOUNT_CAMERA, YORK, york_camera, york_truth
+from tests.benchmarks.bench_vp import R_MOUNT_CAMERA, YORK, forward_stage, york_image, york_stage, york_truth
 from tests.stages import panoramas
-from tests.stages.panoramas import Answer
-from tests.stages.reliability import DATA, answer, grd_stage
+from tests.stages.panoramas import DirectionErrors, direction_errors
+from tests.stages.reliability import DATA, grd_stage
 from tests.stages.simulated_views import SCENES, View, views
 
 IMAGES = Path(__file__).resolve().parents[2] / "docs" / "images"
-FORWARD = Pose(quaternion_xyzw=(-0.5, 0.5, -0.5, 0.5))
 SEED = 201  # of worlds that no threshold was chosen with
-MOST_PICTURES = 3
-Groups = dict[str, list[Answer]]
+MAX_FAILURES = 3
+Groups = dict[str, list[DirectionErrors]]
 
 
 def main() -> None:
@@ -64,9 +62,9 @@ def draw(axes: plt.Axes, title: str, groups: Groups) -> None:
 
 
 def simulated_groups(count: int) -> Groups:
-    """Five scenes without and with clutter; pictures of the failures with clutter."""
+    """Five scenes without and with clutter; images of the failures with clutter."""
     groups: Groups = {}
-    pictures = 0
+    failures = 0
     for clutter in (False, True):
         name = "with clutter" if clutter else "without clutter"
         for scene in SCENES:
@@ -76,17 +74,17 @@ def simulated_groups(count: int) -> Groups:
                 if view.tilt is not None:
                     vp.on_tilt(view.tilt)
                 found = vp.on_image(view.image)
-                result = answer(found, view.R_world_mount, view.truth)
+                result = direction_errors(found, view.R_world_mount, view.truth)
                 groups.setdefault(name, []).append(result)
-                if clutter and pictures < MOST_PICTURES and (not result.has_frame or not result.within):
-                    pictures += 1
-                    save_failure(IMAGES / f"vp_failure_{pictures}.jpg", scene, view, found.line_end, result)
+                if clutter and failures < MAX_FAILURES and (not result.has_frame or not result.within):
+                    failures += 1
+                    save_failure(IMAGES / f"vp_failure_{failures}.jpg", scene, view, found.line_end, result)
     return groups
 
 
-def save_failure(file: Path, scene: str, view: View, ends: np.ndarray, result: Answer) -> None:
+def save_failure(file: Path, scene: str, view: View, ends: np.ndarray, result: DirectionErrors) -> None:
     """The image with its lines, and below it the reason and the errors."""
-    picture = np.ascontiguousarray(view.colour[..., ::-1])
+    image = np.ascontiguousarray(view.colour[..., ::-1])
     camera = view.scenario.cameras.vehicle if view.camera_mount is CameraMount.VEHICLE else view.scenario.cameras.drone
     assert camera is not None
     for arc in ends @ grd_stage(view).settings.T_mount_camera.matrix()[:3, :3]:
@@ -94,14 +92,14 @@ def save_failure(file: Path, scene: str, view: View, ends: np.ndarray, result: A
         path = (1 - share) * arc[0] + share * arc[1]
         at = camera.true_lens.project(path / np.linalg.norm(path, axis=1, keepdims=True))
         if np.isfinite(at).all():
-            cv2.polylines(picture, [np.rint(at).astype(np.int32)], False, (0, 255, 255), 1, cv2.LINE_AA)
+            cv2.polylines(image, [np.rint(at).astype(np.int32)], False, (0, 255, 255), 1, cv2.LINE_AA)
     pairs = zip(result.error_deg, result.sigma_deg, strict=True)
     errors = ", ".join(f"{error:.1f} ({sigma:.2f})" for error, sigma in pairs)
     text = (f"{scene}, {view.camera_mount.value}: {result.reason}", f"error (stated sigma) [deg]: {errors or '-'}")
-    bar = np.full((50, picture.shape[1], 3), 255, np.uint8)
+    bar = np.full((50, image.shape[1], 3), 255, np.uint8)
     for row, line in enumerate(text):
         cv2.putText(bar, line[:110], (6, 20 + 22 * row), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (0, 0, 0), 1, cv2.LINE_AA)
-    cv2.imwrite(str(file), np.vstack([picture, bar]), [cv2.IMWRITE_JPEG_QUALITY, 70])
+    cv2.imwrite(str(file), np.vstack([image, bar]), [cv2.IMWRITE_JPEG_QUALITY, 70])
     print(f"{file.name}: {' | '.join(text)}")  # noqa: T201
 
 
@@ -112,37 +110,23 @@ def real_groups(count: int) -> Groups:
         for name in panoramas.LABELS:
             group = "panorama kept back" if name == panoramas.KEPT_BACK else "three panoramas"
             for mount in CameraMount:
-                groups.setdefault(group, []).extend(panoramas.answers(name, mount, count, SEED))
+                groups.setdefault(group, []).extend(panoramas.errors_of_renders(name, mount, count, SEED))
     if YORK.exists():
         groups["York, training half"] = york()
     return groups
 
 
-def york() -> list[Answer]:
+def york() -> list[DirectionErrors]:
     """Three directions of each image, without gravity; labels good to about 1 deg."""
-    focal, column, row = york_camera()
-    lens = {"model": "ocam", "polynomial": (-focal, 0.0, 0.0, 0.0, 0.0), "centre_px": (column, row)}
-    vp = forward_stage(lens | {"max_off_axis_deg": 60.0})
-    found: list[Answer] = []
+    vp = york_stage()
+    found: list[DirectionErrors] = []
     for folder in sorted(YORK.glob("P*")):
-        grey = cv2.imread(str(folder / f"{folder.name}.jpg"), cv2.IMREAD_GRAYSCALE)
-        seen = vp.on_image(Image(stamp_ns=0, frame_id="camera_drone", grey=grey))
-        cosine = np.abs(seen.direction @ R_MOUNT_CAMERA @ york_truth(folder).T)
+        directions = vp.on_image(york_image(folder))
+        cosine = np.abs(directions.direction @ R_MOUNT_CAMERA @ york_truth(folder).T)
         error = np.degrees(np.arccos(np.clip(cosine.max(axis=1, initial=0.0), 0.0, 1.0)))
-        found.append(Answer(error, np.degrees(seen.sigma_rad), bool((seen.frame >= 0).any()), seen.reason))
+        has_frame = bool((directions.frame >= 0).any())
+        found.append(DirectionErrors(error, np.degrees(directions.sigma_rad), has_frame, directions.reason))
     return found
-
-
-def forward_stage(lens: object) -> GreatCircleVp:
-    """grd's stage for a camera that faces forward, without gravity, one Manhattan frame."""
-    return GreatCircleVp(
-        camera_mount=CameraMount.DRONE,
-        T_mount_camera=FORWARD,
-        lens=lens,
-        search_deg=45.0,
-        vertical_sigma_deg=20.0,
-        max_frames=1,
-    )
 
 
 def corridor() -> str:
@@ -160,7 +144,7 @@ def corridor() -> str:
     off = [90.0 - math.degrees(math.acos(abs(float(d[i] @ d[j])))) for i in range(len(d)) for j in range(i)]
     sigma = ", ".join(f"{s:.2f}" for s in np.degrees(found.sigma_rad))
     angles = ", ".join(f"{angle:.2f}" for angle in off)
-    return f"corridor: {len(d)} directions, each by its lines off square by {angles} deg; sigma {sigma} deg"
+    return f"corridor: {len(d)} directions, each by its own lines, off a right angle by {angles} deg; sigma {sigma} deg"
 
 
 if __name__ == "__main__":

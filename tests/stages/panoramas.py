@@ -17,7 +17,7 @@ import numpy as np
 
 from stages.geometry.frames import Pose, quaternions_xyzw, rotation_from_rpy_deg, rotation_z
 from stages.geometry.lens import Equidistant
-from stages.messages import CameraMount, DroneTilt, Image
+from stages.messages import CameraMount, DroneTilt, Image, VanishingDirections
 from stages.vp import GreatCircleVp
 
 FOLDER = Path(__file__).resolve().parents[3] / "shared" / "data" / "panoramas"
@@ -176,8 +176,8 @@ def jpeg(image: np.ndarray, quality: int) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Answer:
-    """Directions of one render: error of each to the nearest labelled one, and its stated sigma."""
+class DirectionErrors:
+    """Directions of one image: error of each to the nearest true one, and its stated sigma."""
 
     error_deg: np.ndarray
     sigma_deg: np.ndarray
@@ -207,23 +207,33 @@ def tilt_at(R_world_drone: np.ndarray, rng: np.random.Generator, stamp_ns: int) 
     )
 
 
-def answers(name: str, camera_mount: CameraMount, count: int, seed: int, tilt: bool = True, **settings) -> list[Answer]:
-    """Answers of `GreatCircleVp` to `count` disturbed renders; `tilt`: the drone has the autopilot's tilt."""
+def direction_errors(found: VanishingDirections, R_world_mount: np.ndarray, truth: np.ndarray) -> DirectionErrors:
+    """Errors of the found directions to the nearest true one; truth (n, 3) has the vertical first, world axes."""
+    cosine = np.abs(found.direction @ R_world_mount.T @ truth.T)
+    cosine = np.where(found.is_vertical[:, None] == (np.arange(len(truth)) == 0), cosine, 0.0)
+    error = np.degrees(np.arccos(np.clip(cosine.max(axis=1, initial=0.0), 0.0, 1.0)))
+    return DirectionErrors(error, np.degrees(found.sigma_rad), bool((found.frame >= 0).any()), found.reason)
+
+
+def grd_stage(camera_mount: CameraMount, **settings) -> GreatCircleVp:
+    """grd's stage for the camera of the renders."""
+    quaternion = quaternions_xyzw(R_MOUNT_CAMERA[camera_mount][None])[0]
+    mount = Pose(quaternion_xyzw=tuple(quaternion))
+    return GreatCircleVp(camera_mount=camera_mount, T_mount_camera=mount, lens=fisheye(), **settings)
+
+
+def errors_of_renders(
+    name: str, camera_mount: CameraMount, count: int, seed: int, tilt: bool = True, **settings
+) -> list[DirectionErrors]:
+    """Errors of grd on `count` disturbed renders; `tilt`: the drone has the autopilot's tilt."""
     rng = np.random.default_rng([int(name), camera_mount is CameraMount.DRONE, seed])
     tilts = np.random.default_rng([seed, 1])
-    quaternion = quaternions_xyzw(R_MOUNT_CAMERA[camera_mount][None])[0]
-    vp = GreatCircleVp(
-        camera_mount=camera_mount, T_mount_camera=Pose(quaternion_xyzw=tuple(quaternion)), lens=fisheye(), **settings
-    )
-    truth, out = true_directions(name), []
+    vp, truth, out = grd_stage(camera_mount, **settings), true_directions(name), []
     for k in range(count):
         stamp_ns = (k + 1) * 1_000_000_000
         image = render(name, camera_mount, random_rotation(rng, camera_mount), rng)
         if tilt and camera_mount is CameraMount.DRONE:
             vp.on_tilt(tilt_at(image.R_world_mount, tilts, stamp_ns))
         found = vp.on_image(Image(stamp_ns=stamp_ns, frame_id=f"camera_{camera_mount.value}", grey=image.grey))
-        cosine = np.abs(found.direction @ image.R_world_mount.T @ truth.T)
-        cosine = np.where(found.is_vertical[:, None] == (np.arange(len(truth)) == 0), cosine, 0.0)
-        error = np.degrees(np.arccos(np.clip(cosine.max(axis=1, initial=0.0), 0.0, 1.0)))
-        out.append(Answer(error, np.degrees(found.sigma_rad), bool((found.frame >= 0).any()), found.reason))
+        out.append(direction_errors(found, image.R_world_mount, truth))
     return out

@@ -9,13 +9,12 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import yaml
 
 from stages.geometry.frames import Pose
-from stages.messages import CameraMount, VanishingDirections
+from stages.messages import CameraMount
 from stages.vp import GreatCircleVp, PaperVp
-from tests.stages.panoramas import Answer
+from tests.stages.panoramas import DirectionErrors, direction_errors
 from tests.stages.simulated_views import View, views
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
@@ -31,9 +30,9 @@ PAPER = {
 }
 
 
-def of_views(scene: str, seeds: Iterable[int], count: int, clutter: bool) -> dict[str, list[Answer]]:
-    """Answers of grd and of the paper's variants to `count` images of each camera of each world."""
-    found: dict[str, list[Answer]] = {name: [] for name in ("grd", *PAPER)}
+def of_views(scene: str, seeds: Iterable[int], count: int, clutter: bool) -> dict[str, list[DirectionErrors]]:
+    """Errors of grd and of the paper's variants to `count` images of each camera of each world."""
+    found: dict[str, list[DirectionErrors]] = {name: [] for name in ("grd", *PAPER)}
     for seed in seeds:
         stages: dict[CameraMount, dict[str, GreatCircleVp | PaperVp]] = {}
         for view in views(scene, seed, count, clutter):
@@ -42,7 +41,7 @@ def of_views(scene: str, seeds: Iterable[int], count: int, clutter: bool) -> dic
             for name, stage in stages[view.camera_mount].items():
                 if isinstance(stage, GreatCircleVp) and view.tilt is not None:
                     stage.on_tilt(view.tilt)
-                found[name].append(answer(stage.on_image(view.image), view.R_world_mount, view.truth))
+                found[name].append(direction_errors(stage.on_image(view.image), view.R_world_mount, view.truth))
     return found
 
 
@@ -64,11 +63,3 @@ def _stages(view: View) -> dict[str, GreatCircleVp | PaperVp]:
     common, rig = _rig(view)
     paper = {name: PaperVp(**common, size_px=rig["size_px"], **settings) for name, settings in PAPER.items()}
     return {"grd": grd_stage(view), **paper}
-
-
-def answer(found: VanishingDirections, R_world_mount: np.ndarray, truth: np.ndarray) -> Answer:
-    """Errors of the found directions to the nearest true one; truth (n, 3) has the vertical first, world axes."""
-    cosine = np.abs(found.direction @ R_world_mount.T @ truth.T)
-    cosine = np.where(found.is_vertical[:, None] == (np.arange(len(truth)) == 0), cosine, 0.0)
-    error = np.degrees(np.arccos(np.clip(cosine.max(axis=1, initial=0.0), 0.0, 1.0)))
-    return Answer(error, np.degrees(found.sigma_rad), bool((found.frame >= 0).any()), found.reason)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import operator
 from collections.abc import Sequence
 from typing import Annotated, Any, Literal, Self
 
@@ -42,14 +43,6 @@ DOWNWARD_RPY_DEG = (180.0, 0.0, -90.0)  # the top of the image is forward, its r
 BELOW_BODY_M = 0.02
 CameraMount = Literal["vehicle", "drone"]
 AnyLens = Equidistant | KannalaBrandt | OCam
-
-
-def _is_zero(value: object) -> bool:
-    return value == 0
-
-
-def _is_none(value: object) -> bool:
-    return value is None  # scenario files leave out a setting that they do not use
 
 
 class _Settings(BaseModel):
@@ -90,12 +83,12 @@ class CameraSettings(_Settings):
     mount: Pose | None = None  # T_vehicle_camera or T_drone_camera; null: at the vehicle origin, under the drone
     rate_hz: float = Field(default=10.0, ge=1, le=15)
     readout_ms: float = Field(default=0.0, ge=0, le=60)  # first to last row; 0: a global shutter
-    dirt_spots: Annotated[int, Field(exclude_if=_is_zero, ge=0, le=100)] = 0  # on the lens
-    flare: Annotated[float, Field(exclude_if=_is_zero, ge=0, le=2)] = 0.0  # strength of glare, streaks, ghosts; 0: none
+    dirt_spots: Annotated[int, Field(exclude_if=operator.not_, ge=0, le=100)] = 0  # on the lens
+    flare: Annotated[float, Field(exclude_if=operator.not_, ge=0, le=2)] = 0.0  # of glare, streaks, ghosts; 0: none
     latency_ms: tuple[float, float] = (30.0, 80.0)  # shortest and longest, from the end of the readout to arrival
     sensor: SensorSettings = SensorSettings()
-    miscalibration: Annotated[CameraMiscalibration | None, Field(exclude_if=_is_none)] = (
-        None  # null: the rig file is exact
+    miscalibration: Annotated[CameraMiscalibration | None, Field(exclude_if=operator.not_)] = (
+        None  # null: the rig is exact
     )
 
     @model_validator(mode="after")

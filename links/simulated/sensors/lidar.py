@@ -8,6 +8,7 @@ target return.
 
 from __future__ import annotations
 
+import operator
 from dataclasses import dataclass
 from typing import Annotated, Literal, Protocol
 
@@ -58,10 +59,6 @@ def _is_dense(footprint: str) -> bool:
     return footprint == "dense"  # scenario files leave out a setting that they do not use
 
 
-def _is_zero(offset: float) -> bool:
-    return offset == 0.0  # as above
-
-
 class LidarSettings(BaseModel):
     """Settings and errors of the sensor."""
 
@@ -77,7 +74,7 @@ class LidarSettings(BaseModel):
     range_noise_m: float = Field(default=0.008, ge=0)  # one sigma on a strong return
     weak_range_noise_m: float = Field(default=0.02, ge=0)  # added at the threshold; falls with power
     laser_bias_m: float = Field(default=0.01, ge=0)  # one sigma over the lasers, constant in a run
-    range_offset_m: Annotated[float, Field(ge=-0.5, le=0.5, exclude_if=_is_zero)] = 0.0  # common to all lasers
+    range_offset_m: Annotated[float, Field(ge=-0.5, le=0.5, exclude_if=operator.not_)] = 0.0  # common to all lasers
     dropout: float = Field(default=0.005, ge=0, lt=1)  # probability that a pulse is lost for no modelled reason
     min_range_m: float | None = None  # None: the model's
     max_range_m: float | None = None

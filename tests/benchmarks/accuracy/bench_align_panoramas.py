@@ -16,11 +16,10 @@ import numpy as np
 import pytest
 
 from stages.align import JointAlign
-from stages.geometry.frames import Pose, quaternions_xyzw, rotation_z
+from stages.geometry.frames import rotation_z
 from stages.kernels.geometry.so3 import log_rotation
 from stages.messages import CameraMount, Image
-from stages.vp import GreatCircleVp
-from tests.stages.panoramas import FOLDER, LABELS, R_MOUNT_CAMERA, fisheye, random_rotation, render, tilt_at
+from tests.stages.panoramas import FOLDER, LABELS, grd_stage, random_rotation, render, tilt_at
 
 COUNT, SEED = int(os.environ.get("GRD_RENDERS", "10")), int(os.environ.get("GRD_RENDERS_SEED", "0"))
 PRIOR_RAD, RIGHT_DEG, NS = math.radians(8.0), 2.0, 1_000_000_000
@@ -34,12 +33,6 @@ pytestmark = [
 ]
 
 
-def stage(camera_mount: CameraMount) -> GreatCircleVp:
-    quaternion = quaternions_xyzw(R_MOUNT_CAMERA[camera_mount][None])[0]
-    pose = Pose(quaternion_xyzw=tuple(quaternion))
-    return GreatCircleVp(camera_mount=camera_mount, T_mount_camera=pose, lens=fisheye())
-
-
 def off(R_true: np.ndarray, R_world_vehicle: np.ndarray, R: np.ndarray) -> np.ndarray:
     """Error (3,) [rad] of the nearest branch, drone axes."""
     about = [R_world_vehicle.T @ rotation_z(k * math.pi / 2) @ R_world_vehicle @ R for k in range(4)]
@@ -50,7 +43,7 @@ def off(R_true: np.ndarray, R_world_vehicle: np.ndarray, R: np.ndarray) -> np.nd
 def pairs(name: str):
     """R_vehicle_drone, R_world_vehicle and the message of each pair."""
     rng = np.random.default_rng([int(name), 7, SEED])
-    vehicle, drone, align = stage(CameraMount.VEHICLE), stage(CameraMount.DRONE), JointAlign()
+    vehicle, drone, align = grd_stage(CameraMount.VEHICLE), grd_stage(CameraMount.DRONE), JointAlign()
     for k in range(COUNT):
         ns = (k + 1) * NS
         up, down = (render(name, m, random_rotation(rng, m), rng) for m in (CameraMount.VEHICLE, CameraMount.DRONE))

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from stages.messages import CameraMount
-from tests.stages.panoramas import FOLDER, KEPT_BACK, LABELS, answers
+from tests.stages.panoramas import FOLDER, KEPT_BACK, LABELS, errors_of_renders
 
 COUNT, SEED = int(os.environ.get("GRD_RENDERS", "20")), int(os.environ.get("GRD_RENDERS_SEED", "0"))
 CASES = {
@@ -49,7 +49,7 @@ def test_stated_sigmas_and_wrong_answers_on_renders_of_real_panoramas():
     used, kept_back = [], []
     for name in LABELS:
         for case, (camera_mount, tilt) in CASES.items():
-            found = answers(name, camera_mount, COUNT, SEED, tilt)
+            found = errors_of_renders(name, camera_mount, COUNT, SEED, tilt)
             (kept_back if name == KEPT_BACK else used).extend(found)
             print(row(f"{name}{' (kept back)' if name == KEPT_BACK else ''}, {case}", found))  # noqa: T201
     print(row("three panoramas", used))  # noqa: T201

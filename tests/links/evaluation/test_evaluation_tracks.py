@@ -231,9 +231,9 @@ def test_an_output_counts_for_precision_and_gospa_only_while_it_is_recent(tmp_pa
 
 def test_false_tracks_have_a_rate_and_a_bound_with_and_without_a_drone(tmp_path):
     t = np.array([0.0, 0.5, 4.0, 4.5])
-    beside = evaluated(make_run(tmp_path / "a", t, truth_at(t) + np.array([0.0, 5.0, 0.0])))
+    displaced = evaluated(make_run(tmp_path / "a", t, truth_at(t) + np.array([0.0, 5.0, 0.0])))
     empty = evaluated(make_run(tmp_path / "b", t, truth_at(t), truth="no drone"))
-    for e in (beside, empty):
+    for e in (displaced, empty):
         assert value(e, "false_tracks") == 2  # a pause of more than a second
         assert value(e, "false_tracks_per_h") == pytest.approx(2 * 360)
         assert value(e, "false_tracks_below_per_h") == pytest.approx(poisson_upper(2) * 360)

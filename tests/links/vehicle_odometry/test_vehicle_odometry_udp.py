@@ -11,8 +11,8 @@ from pydantic import ValidationError
 
 from flow.link import LinkError
 from links.clock import host_time
+from links.udp import age_s
 from links.vehicle_odometry import VehicleOdometry
-from links.vehicle_odometry.udp import age_s
 from tests.links import ports
 
 POSE = {"xyz_m": [1.0, 2.0, 3.0], "quaternion_xyzw": [0.0, 0.0, 0.0, 1.0], "covariance": None}
@@ -106,8 +106,8 @@ def test_leaving_the_context_ends_a_waiting_listener(port):
 
 
 def test_a_port_that_cannot_be_opened_is_an_error_that_names_what_to_check(port):
-    with pytest.raises(LinkError, match="set `port` to receive"):
-        VehicleOdometry().listen()
+    with pytest.raises(LinkError, match="set `port` to receive"), VehicleOdometry().listen():
+        pass
     with (
         VehicleOdometry(port=port).listen(),
         pytest.raises(LinkError, match=rf"cannot listen on UDP 127.0.0.1:{port}.*another grd"),
@@ -117,5 +117,5 @@ def test_a_port_that_cannot_be_opened_is_an_error_that_names_what_to_check(port)
 
 
 def test_beyond_loopback_the_sender_is_required():
-    with pytest.raises(ValidationError, match="sender: set the odometry's sender"):
+    with pytest.raises(ValidationError, match="sender: set the sender of the vehicle's odometry"):
         VehicleOdometry(bind="0.0.0.0", port=5000)

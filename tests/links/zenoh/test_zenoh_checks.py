@@ -62,7 +62,9 @@ def test_preflight_of_a_host_reports_whether_the_other_one_runs(tmp_path):
     with HostProcess(config, hosts, "vehicle"):
         assert "to_vehicle: vehicle replies; its clock differs by" in preflight("drone")["ok"]
     with HostProcess(config, hosts, "drone", ahead_s=-5.0):
-        assert "beats: drone replies; its clock differs by 5000." in preflight("vehicle")["ok"].replace("4999.", "5000.")
+        assert "beats: drone replies; its clock differs by 5000." in preflight("vehicle")["ok"].replace(
+            "4999.", "5000."
+        )
 
 
 def test_host_and_recording_contradict_each_other(tmp_path):

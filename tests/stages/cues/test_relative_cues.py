@@ -51,7 +51,7 @@ def motion(t_s: float, xyz_map_m, yaw_rad: float = 0.0) -> VehicleMotion:
 
 @pytest.mark.parametrize("latitude_deg", [-60.0, 0.0, 35.0, 80.0])
 def test_a_displacement_and_a_move_are_inverse(latitude_deg):
-    origin = Geographic(math.radians(latitude_deg), math.radians(179.9999), 500.0)  # beside the antimeridian
+    origin = Geographic(math.radians(latitude_deg), math.radians(179.9999), 500.0)  # next to the antimeridian
     enu_m = np.array([120.0, -310.0, 45.0])
     assert displacement_enu_m(origin, moved(origin, enu_m)) == pytest.approx(enu_m, abs=1e-3)
 

@@ -25,7 +25,7 @@ def at_ns(t_s):
     return START_NS + round(t_s * 1e9)
 
 
-def flown(velocity_mps, seconds=4.0, beside=(), hidden_s=(9.0, 9.0), stage=None, seed=0, place_m=PLACE_M):
+def flown(velocity_mps, seconds=4.0, others_m=(), hidden_s=(9.0, 9.0), stage=None, seed=0, place_m=PLACE_M):
     """(fixes, states) of a small object that flies past, seen once a rotor turn, and other points in each turn."""
     stage, rng = stage or ImmPdafTrack(), np.random.default_rng(seed)
     found = []
@@ -33,7 +33,7 @@ def flown(velocity_mps, seconds=4.0, beside=(), hidden_s=(9.0, 9.0), stage=None,
         t_s = 0.1 * k
         shown = not hidden_s[0] <= t_s < hidden_s[1]
         own = place_m + t_s * np.asarray(velocity_mps) + rng.normal(0, 0.05, (3, 3)) if shown else np.zeros((0, 3))
-        others = np.array(beside, dtype=np.float64).reshape(-1, 3)
+        others = np.array(others_m, dtype=np.float64).reshape(-1, 3)
         found += stage.on_points(swept(np.concatenate([own, others]), at_ns(t_s)))
     fixes = [m for m in found if isinstance(m, DroneFix)]
     return fixes, [m for m in found if isinstance(m, TrackState)]
@@ -55,7 +55,7 @@ def test_a_small_object_that_moves_is_followed():
 
 
 def test_standing_and_large_objects_are_not_followed():
-    still, states = flown((0.0, 0.0, 0.0), beside=WALL_M)
+    still, states = flown((0.0, 0.0, 0.0), others_m=WALL_M)
     assert still == []
     assert {state.state for state in states} == {TrackingState.SEARCHING}
     by_any, _ = flown((0.0, 0.0, 0.0), stage=ImmPdafTrack(least_moved_m=0.0))
@@ -64,7 +64,7 @@ def test_standing_and_large_objects_are_not_followed():
 
 def test_a_small_object_near_a_wall_belongs_to_it():
     near = WALL_M.mean(axis=0) + np.array([0.0, -1.5, 0.0])
-    fixes, _ = flown((0.3, 0.0, 0.0), seconds=6.0, beside=WALL_M, place_m=near)
+    fixes, _ = flown((0.3, 0.0, 0.0), seconds=6.0, others_m=WALL_M, place_m=near)
     assert fixes == []
 
 

@@ -5,6 +5,7 @@ Source: ours.
 
 from __future__ import annotations
 
+import operator
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
@@ -31,10 +32,6 @@ MOVERS: dict[str, tuple[int, int, int]] = {  # kind: moving cars, birds, balloon
 }
 
 
-def _is_false(value: object) -> bool:
-    return value is False
-
-
 def _is_usual(sky: str) -> bool:
     return sky == "usual"  # scenario files leave out a setting that they do not use
 
@@ -58,7 +55,7 @@ class SceneSettings(BaseModel):
     # varied: gliding, circling and hovering birds, flocks, insects, kites and bags in place of `birds` and `balloons`
     sky: Annotated[Literal["usual", "varied"], Field(exclude_if=_is_usual)] = "usual"
     # furniture, planters, signs and boards at odd angles, oblique wires, people; windows reflect the scene
-    clutter: Annotated[bool, Field(exclude_if=_is_false)] = False
+    clutter: Annotated[bool, Field(exclude_if=operator.not_)] = False
     vehicle_lane_y_m: float = -1.9  # the vehicle's start position across the street
     vehicle_yaw_deg: float = 0.0
 

@@ -1,0 +1,106 @@
+"""Datagrams from one sender, each with a JSON object or text; a JSON object may have `age_s`.
+
+`age_s`: age of the measurement at the time of sending [s]; 0 when it is missing. A datagram that is older than one
+second is skipped and counted.
+
+Source: ours.
+"""
+
+from __future__ import annotations
+
+import json
+import socket
+import threading
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from ipaddress import IPv4Address
+from typing import Any, ClassVar
+
+from pydantic import Field, model_validator
+
+from flow.link import LinkError, Record, SourceSettings
+from links.clock import datagram_time
+
+DATAGRAM_BYTES = 4096
+WAKE_S = 0.2  # how often a waiting listener checks whether it was closed
+MAX_AGE_S = 1.0
+WRONG_AGE = "age_s invalid or too large"  # counter
+
+
+class UdpSettings(SourceSettings):
+    """Settings of a source that receives datagrams."""
+
+    what: ClassVar[str] = "data"  # is received, for errors
+
+    port: int | None = Field(None, ge=1, le=65535)  # UDP, live; None: not received live
+    bind: IPv4Address = IPv4Address("127.0.0.1")  # this host's address
+    sender: IPv4Address | None = None  # the sender's address; others are ignored
+
+    @model_validator(mode="after")
+    def _sender_is_known(self) -> UdpSettings:
+        if self.sender is None and not self.bind.is_loopback:
+            raise ValueError(
+                f"sender: set the sender of {self.what} when binding to {self.bind}, so that others are ignored"
+            )
+        return self
+
+
+@contextmanager
+def listen_udp(settings: UdpSettings, counters: Counter[str]) -> Iterator[Iterator[Record]]:
+    """Open the socket and yield an iterator of records, which ends with the context.
+
+    LinkError without `port`, or when the socket cannot be opened.
+    """
+    what, port, bind = settings.what, settings.port, str(settings.bind)
+    if port is None:
+        raise LinkError(f"{settings.topic}: set `port` to receive {what}, or remove the link")
+    closed = threading.Event()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
+        try:
+            datagram_time.enable_stamps(udp)
+            udp.bind((bind, port))
+        except OSError as error:
+            raise LinkError(
+                f"cannot listen on UDP {bind}:{port} for {what}: {error.strerror}. Check `bind` and `port`; "
+                "is another grd listening there?"
+            ) from error
+        udp.settimeout(WAKE_S)
+        try:
+            yield _records(udp, closed, settings, counters)
+        finally:
+            closed.set()
+
+
+def _records(
+    udp: socket.socket, closed: threading.Event, settings: UdpSettings, counters: Counter[str]
+) -> Iterator[Record]:
+    sender = None if settings.sender is None else str(settings.sender)
+    while not closed.is_set():
+        try:
+            data, ancillary, _, (host, _) = udp.recvmsg(DATAGRAM_BYTES, datagram_time.ANCILLARY_BYTES)
+        except TimeoutError:
+            continue
+        except OSError as error:
+            if closed.is_set():
+                return
+            raise LinkError(f"{settings.what}: {error.strerror}: is the network interface still up?") from error
+        arrival_ns = datagram_time.arrival_ns(ancillary)
+        if sender is not None and host != sender:
+            counters["from other senders"] += 1
+            continue
+        age = age_s(data)
+        if age is None:
+            counters[WRONG_AGE] += 1
+            continue
+        yield Record(settings.topic, arrival_ns, arrival_ns - round(1e9 * age), data)
+
+
+def age_s(data: bytes) -> float | None:
+    """`age_s` of a datagram, 0 without it; None: invalid or above MAX_AGE_S."""
+    try:
+        fields: Any = json.loads(data)
+        age = float(fields.get("age_s", 0.0))
+    except (ValueError, TypeError, AttributeError, OverflowError, RecursionError):
+        return 0.0 if b"age_s" not in data else None  # `decode` rejects invalid JSON
+    return age if 0.0 <= age <= MAX_AGE_S else None

@@ -39,11 +39,6 @@ class Latency:
         index = int(np.searchsorted(up_to, max(self.count * percent / 100, 1)))
         return float(min(2 ** ((index + 1) / BINS_PER_OCTAVE), self.max_ns))
 
-    @property
-    def mean_ns(self) -> float:
-        """Mean duration [ns]; 0 without data."""
-        return self.total_ns / self.count if self.count else 0.0
-
     def to_list(self) -> list[int]:
         """All counts as plain numbers, for `of_list`."""
         return [self.count, self.total_ns, self.max_ns, *self._bins]

@@ -31,10 +31,14 @@ from typing_extensions import TypeVar
 from flow.message import Message, port_name
 
 
-class Settings(BaseModel):
-    """Base of the settings of a stage or link: checked when it is made, then immutable. No setting: this class."""
+class StrictModel(BaseModel):
+    """Base of settings and of groups of settings: unknown names and non-finite numbers are errors; immutable."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Settings(StrictModel):
+    """Base of the settings of a stage or link: checked when it is made. No setting: this class."""
 
 
 S = TypeVar("S", bound=Settings, default=Settings, covariant=True)

@@ -15,8 +15,9 @@ from __future__ import annotations
 import enum
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from flow.stage import StrictModel
 from links.mavlink.commands import ACCEPTED, DENIED, FAILED, command_long
 from links.mavlink.transport.framing import dialect
 
@@ -27,10 +28,8 @@ REQUESTS = 3
 UNCONFIRMED = 10  # times that an origin is sent before it is reported
 
 
-class GlobalOrigin(BaseModel):
+class GlobalOrigin(StrictModel):
     """A WGS84 position; altitude above mean sea level."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     latitude_deg: float = Field(ge=-90, le=90)
     longitude_deg: float = Field(ge=-180, le=180)

@@ -6,10 +6,11 @@
 A residual that neither bias nor noise explains, three times in a row, is a contradiction: the cue is of another drone,
 or its sensor has failed. It is trusted again after ten residuals in a row that agree.
 
-The bias learns only from residuals that agree. Agreements and contradictions are counted in measurements, not in time: a
-cue at 1 Hz is distrusted after 3 s and trusted again after 10 s, one at 10 Hz in a tenth of it.
+The bias learns only from residuals that agree. Agreements and contradictions are counted in measurements, not in time:
+a cue at 1 Hz is distrusted after 3 s and trusted again after 10 s, one at 10 Hz in a tenth of it.
 
-Source: ours (also CONTRADICTIONS and AGREEMENTS, chosen, not measured); Brown, Hwang, Introduction to Random Signals and Applied Kalman Filtering, ch. 3 (Gauss-Markov).
+Source: ours (also CONTRADICTIONS and AGREEMENTS, chosen, not measured); Brown, Hwang, Introduction to Random Signals
+and Applied Kalman Filtering, ch. 3 (Gauss-Markov).
 """
 
 from __future__ import annotations

@@ -11,7 +11,8 @@ candidate must reach 72 % by the LiDAR alone. A cue that contradicts the candida
 A cue that contradicts the drone found by the LiDAR alone is not used and is reported (`bias.py`).
 
 Source: ours. `max_sum` follows from the 72 %; 0.3 was chosen so that a wrong cue delays the first fix by few seconds
-(`docs/how-to/cues.md`, Measure); NEWEST, OLDEST_NS and the recovery are chosen, not measured. The mixture after Box, Tiao, "A Bayesian approach to some outlier problems", Biometrika 55 (1968).
+(`docs/how-to/cues.md`, Measure); NEWEST, OLDEST_NS and the recovery are chosen, not measured. The mixture after Box,
+Tiao, "A Bayesian approach to some outlier problems", Biometrika 55 (1968).
 """
 
 from __future__ import annotations
@@ -23,8 +24,9 @@ from statistics import median_low
 from typing import NamedTuple
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from flow.stage import StrictModel
 from stages.cues.bias import CueBias
 from stages.geometry.frames import Array64
 from stages.geometry.trajectory import VehicleTrajectory
@@ -35,10 +37,8 @@ OLDEST_NS = 1_500_000_000
 CONTRADICTS_NATS = -1.0  # below: the cue contradicts the candidate
 
 
-class CueWeights(BaseModel):
+class CueWeights(StrictModel):
     """What cues may add to the log-odds of a candidate [nats]."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     outlier_probability: float = Field(default=0.3, gt=0, lt=0.5)  # that a cue is of another object
     max_gnss: float = Field(default=2.0, ge=0, le=6)

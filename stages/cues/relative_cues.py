@@ -22,9 +22,9 @@ from collections import Counter
 from typing import Any, ClassVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
-from flow.stage import Settings, Stage
+from flow.stage import Settings, Stage, StrictModel
 from stages.cues.geodesy import Geographic, displacement_enu_m
 from stages.cues.map_north import MapNorth
 from stages.geometry.frames import Array64, heading_rad, rotation_z
@@ -40,11 +40,7 @@ ZERO_M = np.zeros(3)
 Vector3 = tuple[float, float, float]
 
 
-class _CueSettings(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class GnssSettings(_CueSettings):
+class GnssSettings(StrictModel):
     """Errors of one GNSS receiver, one sigma an axis, and the antenna on the vehicle."""
 
     latency_s: float = Field(default=0.2, ge=0, le=2)
@@ -56,7 +52,7 @@ class GnssSettings(_CueSettings):
     heading_sigma_deg: float = Field(default=3.0, gt=0, le=45)  # of a heading that comes without its own
 
 
-class UwbSettings(_CueSettings):
+class UwbSettings(StrictModel):
     """Errors of the ranging, one sigma, and the device on the vehicle. Decawave DW1000: 0.1 m in line of sight."""
 
     latency_s: float = Field(default=0.02, ge=0, le=2)
@@ -65,7 +61,7 @@ class UwbSettings(_CueSettings):
     anchor_vehicle_m: Vector3 = (0.0, 0.0, 0.0)  # position on the vehicle
 
 
-class AltitudeSettings(_CueSettings):
+class AltitudeSettings(StrictModel):
     """Errors of the altitude above home by the autopilot's estimator, one sigma, and the height of the take-off point.
 
     Without GNSS height its slow error is that of the barometer.

@@ -29,8 +29,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
 
+from flow.stage import StrictModel
 from stages.detect.candidate import (
     OPEN_NEIGHBOUR_SCORE,
     SINGLE_RETURN_WIRE_M,
@@ -50,10 +50,8 @@ FLIGHT_MPS = (0.0, 2.0, 4.0, 6.0, 9.0, 12.0)
 FLIGHT_NATS = (1.0, 1.0, 0.0, -2.0, -4.0, -7.0)
 
 
-class ClassifierWeights(BaseModel):
+class ClassifierWeights(StrictModel):
     """Log likelihood ratios [nats] of a drone over an alternative, for each kind of evidence, and their caps."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     # over false returns
     small_m: float = 14.0  # to this range false returns and birds return as many pulses as drones; few beyond unseen_m

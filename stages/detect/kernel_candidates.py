@@ -10,8 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from flow.stage import StrictModel
 from stages.kernels.detect.kernel_candidates import lowest_indices, middle_m, minima, neighbour_pixels, own_pixels
 from stages.kernels.detect.kernel_score import score_kernel
 from stages.messages import DepthImage
@@ -43,7 +44,7 @@ def score_image(
 FIRST_SORTED = 16_384  # pixels searched first for minima; sorting all of a full image takes as long as scoring it
 
 
-class Gates(BaseModel):
+class Gates(StrictModel):
     """Conditions that a candidate must satisfy to be accepted. None (or false) turns a gate off.
 
     Chosen by reasoning, not fitted to any recording:
@@ -60,8 +61,6 @@ class Gates(BaseModel):
       surroundings of a single chord are not measured: it may be the top of a post or the edge of a sign. A sweep
       crosses a drone about five times at 12 m, twice at 30 m.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     min_inner_px: int | None = Field(default=3, ge=1)
     whole_box: bool = True

@@ -10,13 +10,13 @@ compass: ArduPilot, Compass setup and interference, and the magnetic field betwe
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from flow.stage import StrictModel
 
 
-class FuseErrors(BaseModel):
+class FuseErrors(StrictModel):
     """Errors, one sigma each."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     fix_variance: float = Field(default=0.7, gt=0)  # true variance of a fix over the one that the tracker reports
     fix_time_s: float = Field(default=0.2, ge=0)  # time constant of the error of a fix
@@ -32,10 +32,8 @@ class FuseErrors(BaseModel):
     changed_frames: float = Field(default=0.05, gt=0, lt=1)  # share of restarts while the autopilot changes its frame
 
 
-class FuseLimits(BaseModel):
+class FuseLimits(StrictModel):
     """Limits of the states of a pose."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     coast_after_s: float = Field(default=0.35, gt=0)  # without a LiDAR position
     lost_after_s: float = Field(default=8.0, gt=0)

@@ -28,15 +28,13 @@ from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
+
+from flow.stage import StrictModel
 
 Array64 = NDArray[np.float64]
 Angle = TypeVar("Angle", float, Array64)
 Vector3 = tuple[float, float, float]
-
-
-class _Settings(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 def rotation_from_rpy_deg(rpy_deg: Vector3) -> Array64:
@@ -108,7 +106,7 @@ def transform(rotation: Array64, translation_m: Array64) -> Array64:
     return T
 
 
-class Pose(_Settings):
+class Pose(StrictModel):
     """A transform in a configuration file: `{xyz_m: [0, 0, 1.2], rpy_deg: [0, 0, 90]}` or with `quaternion_xyzw`."""
 
     xyz_m: Vector3 = (0.0, 0.0, 0.0)
@@ -132,7 +130,7 @@ class Pose(_Settings):
         return transform(rotation, np.asarray(self.xyz_m, dtype=np.float64))
 
 
-class Harmonic(_Settings):
+class Harmonic(StrictModel):
     """One term of the servo encoder's error: amplitude * sin(order * angle + phase)."""
 
     order: Annotated[int, Field(ge=1, le=16)]
@@ -147,7 +145,7 @@ def _is_uncalibrated(value: float) -> bool:
     return value == UNCALIBRATED_DEG
 
 
-class LidarMount(_Settings):
+class LidarMount(StrictModel):
     """Mount of the LiDAR on the vehicle: T_vehicle_lidar = T_vehicle_turntable Rz(angle) T_turntable_lidar.
 
     angle = sign * (servo position - zero) - encoder error. `turns: false` is a fixed LiDAR without servo.

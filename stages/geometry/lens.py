@@ -22,8 +22,9 @@ import math
 from typing import Annotated, Literal, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, field_validator, model_validator
+from pydantic import Field, PrivateAttr, field_validator, model_validator
 
+from flow.stage import StrictModel
 from stages.geometry.frames import Array64
 from stages.kernels.geometry.lens import ANGLE_SERIES, OCAM, polynomial_kernel, project, rho_of_theta, series, unproject
 
@@ -32,10 +33,8 @@ Pixel = tuple[float, float]
 WIDEST_RHO = 20.0  # focal lengths; no image circle is wider
 
 
-class _Lens(BaseModel):
+class _Lens(StrictModel):
     """What all lenses share. A ray or pixel beyond `max_off_axis_deg` gives NaN, never a wrong number."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     centre_px: Pixel  # (column, row) of the optical axis
     max_off_axis_deg: float = Field(default=117.5, gt=0, le=150)

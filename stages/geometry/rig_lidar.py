@@ -9,18 +9,17 @@ import math
 import operator
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
+from flow.stage import StrictModel
 from stages.geometry.frames import LidarMount
 from stages.geometry.lidar_models import LidarModel, LidarProfile, lidar_profile
 
 OusterProfile = Literal["LEGACY", "RNG19_RFL8_SIG16_NIR16", "RNG15_RFL8_NIR8", "RNG19_RFL8_SIG16_NIR16_DUAL"]
 
 
-class LidarBeams(BaseModel):
+class LidarBeams(StrictModel):
     """Beams of one unit, as measured by the manufacturer, in the packet's order; for an Ouster also its packets."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     elevation_deg: tuple[float, ...]
     azimuth_deg: tuple[float, ...]  # offsets, positive in the sense of rotation
@@ -34,10 +33,8 @@ class LidarBeams(BaseModel):
     )
 
 
-class RigLidar(BaseModel):
+class RigLidar(StrictModel):
     """`rig.lidar`: an Ouster needs its `beams`; a Velodyne has none, a Hesai XT may have them."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     model: LidarModel = "VLP-16"
     mount: LidarMount = LidarMount()

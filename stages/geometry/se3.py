@@ -30,11 +30,6 @@ def composed_covariance(P: Array64, R_step: Array64, t_step_m: Array64, Q: Array
     return 0.5 * (moved + moved.T)
 
 
-def position_covariance(P: Array64, R: Array64) -> Array64:
-    """Position covariance (3, 3) [m^2] in the parent frame of R, from a pose covariance P (6, 6)."""
-    return R @ P[3:, 3:] @ R.T
-
-
 def mahalanobis2(e: Array64, S: Array64) -> float:
     """Squared Mahalanobis distance e^T S^-1 e: chi-square distributed where S is the covariance of e."""
     return float(e @ np.linalg.solve(S, e))

@@ -170,13 +170,6 @@ class VehicleTrajectory:
         """Whether the result of `at` for a time lies in the current frame map."""
         return self._joined or stamp_ns >= self._frame_start_ns
 
-    def at_in_current_frame(self, stamp_ns: int) -> tuple[Array64, Array64]:
-        """R and t in the current frame map; before its first pose extrapolated backwards with constant velocity."""
-        if self.in_current_frame(stamp_ns):
-            return self.at(stamp_ns)
-        first_ns, R, t = next(pose for pose in self._poses if pose[0] >= self._frame_start_ns)
-        return moved(R, t, *self._newest_rates(), (stamp_ns - first_ns) * 1e-9)
-
     def rate_radps(self, stamp_ns: int) -> Array64:
         """Angular velocity (3,) in vehicle axes; zero where no pose gives it."""
         before, after = self.at(stamp_ns - STEP_NS // 2)[0], self.at(stamp_ns + STEP_NS // 2)[0]

@@ -17,8 +17,9 @@ from typing import cast
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from flow.stage import StrictModel
 from stages.geometry.frames import Array64
 from stages.geometry.lens import Equidistant, KannalaBrandt, OCam
 
@@ -26,10 +27,8 @@ END_NOISE_PX = 0.5  # standard deviation of a segment's end across the segment
 RIM_PX = 6  # segments this close to the edge of the field of view are dropped
 
 
-class ViewDirection(BaseModel):
+class ViewDirection(StrictModel):
     """Direction of the optical axis of one rectified view."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     azimuth_deg: float = Field(ge=-360, le=360)  # in the image: 0 right, 90 down
     off_axis_deg: float = Field(ge=0, le=150)

@@ -17,8 +17,9 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from flow.stage import StrictModel
 from stages.messages import PoseEstimate, PoseState, RelativePose
 
 MAX_AHEAD_NS = 50_000_000  # a pose further in the future has another clock
@@ -52,10 +53,8 @@ class RejectReason(enum.Enum):
     NO_ATTITUDE = "no attitude from autopilot"
 
 
-class PoseLimits(BaseModel):
+class PoseLimits(StrictModel):
     """Limits for sending a pose: one sigma of the worst axis, and age."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     position_sigma_m: float = Field(default=0.35, gt=0, le=5)  # 95 % are within 2.8 sigma, 1 m
     rotation_sigma_deg: float = Field(default=5.0, gt=0, le=15)

@@ -25,8 +25,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from flow.stage import StrictModel
 from links.mavlink.commands import (
     ACCEPTED,
     ACK_TIMEOUT_NS,
@@ -61,10 +62,8 @@ IMU_MESSAGES: dict[ProfileName, tuple[str, ...]] = {
 ESTIMATOR_MESSAGES: dict[ProfileName, str] = {"ardupilot": "EKF_STATUS_REPORT", "px4": "ESTIMATOR_STATUS"}
 
 
-class MessageRates(BaseModel):
+class MessageRates(StrictModel):
     """Rates to request; 0: not requested, the autopilot's own settings apply."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     imu_hz: float = Field(default=50.0, ge=0, le=400)
     attitude_hz: float = Field(default=25.0, ge=0, le=400)

@@ -22,10 +22,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from pymavlink.dialects.v20 import ardupilotmega
 
 from flow.link import Record
+from flow.stage import StrictModel
 from links.mavlink.ned_frd import (
     flip_yz,
     rpy_from_R_odom_drone,
@@ -52,10 +53,8 @@ QUALITY_PERCENT = 100
 INT16 = 32767
 
 
-class AutopilotSettings(BaseModel):
+class AutopilotSettings(StrictModel):
     """Flight, message rates and errors of the autopilot."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     flight: FlightSettings = FlightSettings()
     drift: DriftSettings = DriftSettings()

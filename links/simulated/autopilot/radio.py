@@ -12,15 +12,15 @@ from __future__ import annotations
 from typing import Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
+
+from flow.stage import StrictModel
 
 BITS_PER_BYTE = 10  # start and stop bit of a serial line
 
 
-class RadioSettings(BaseModel):
+class RadioSettings(StrictModel):
     """Delays and losses of one direction."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     latency_s: float = Field(default=0.006, ge=0, le=5)  # minimum
     jitter_s: float = Field(default=0.004, ge=0, le=5)  # mean of the delay above the minimum

@@ -15,8 +15,9 @@ ranging: Marano et al., IEEE JSAC 28 (2010), positive errors of up to several me
 from __future__ import annotations
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from flow.stage import StrictModel
 from links.simulated.world.motion import gauss_markov, interpolate
 from stages.cues.geodesy import Geographic, moved
 from stages.geometry.frames import Array64, rotation_z
@@ -26,11 +27,7 @@ Vector3 = tuple[float, float, float]
 ORIGIN = Geographic(float(np.radians(35.6581)), float(np.radians(139.7017)), 40.0)  # of the simulated world
 
 
-class _Settings(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class ReceiverSettings(_Settings):
+class ReceiverSettings(StrictModel):
     """A GNSS receiver, one sigma an axis."""
 
     rate_hz: float = Field(default=5.0, ge=0.2, le=50)
@@ -45,7 +42,7 @@ class ReceiverSettings(_Settings):
     heading_sigma_deg: float | None = Field(default=None, ge=0, le=45)  # constant error of a heading; None: no heading
 
 
-class RangingSettings(_Settings):
+class RangingSettings(StrictModel):
     """A pair of ranging radios."""
 
     rate_hz: float = Field(default=10.0, ge=0.2, le=100)
@@ -58,7 +55,7 @@ class RangingSettings(_Settings):
     of_drone: int = Field(default=1, ge=1, le=10)
 
 
-class BarometerSettings(_Settings):
+class BarometerSettings(StrictModel):
     """The drone's altitude above home by its autopilot's estimator, which is the road at the vehicle's start."""
 
     drift_m: float = Field(default=1.0, ge=0, le=100)
@@ -67,7 +64,7 @@ class BarometerSettings(_Settings):
     offset_m: float = 0.0  # a wrong cue
 
 
-class CueSettings(_Settings):
+class CueSettings(StrictModel):
     """The cues of a scenario; None: not present. The drone's receiver and barometer need an autopilot."""
 
     drone: ReceiverSettings | None = None  # GPS_RAW_INT

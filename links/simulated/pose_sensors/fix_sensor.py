@@ -18,9 +18,10 @@ import json
 import math
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from flow.link import Record
+from flow.stage import StrictModel
 from links.simulated.pose_sensors.pose_source import FIX_TOPIC
 from links.simulated.world.scene import Truth
 
@@ -28,10 +29,8 @@ NS = 1_000_000_000
 TICKS_PER_FIX = 5  # the host's clock ticks at 50 Hz
 
 
-class FixSensorSettings(BaseModel):
+class FixSensorSettings(StrictModel):
     """Rate, delay and errors of the fixes."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     first_s: float = Field(default=2.0, ge=0)  # the search finds the drone
     rate_hz: float = Field(default=10.0, ge=1, le=50)

@@ -18,9 +18,10 @@ import json
 import math
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from flow.link import Record
+from flow.stage import StrictModel
 from links.simulated.pose_sensors.pose_source import ROTATION_TOPIC
 from links.simulated.world.motion import rotations_from_vectors
 from links.simulated.world.scene import Truth
@@ -30,10 +31,8 @@ NS = 1_000_000_000
 HALF_PI = 0.5 * math.pi
 
 
-class RotationSensorSettings(BaseModel):
+class RotationSensorSettings(StrictModel):
     """Rate, delay and errors of the rotations."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     rate_hz: float = Field(default=5.0, ge=0.1, le=50)
     latency_s: float = Field(default=0.13, ge=0, le=0.5)

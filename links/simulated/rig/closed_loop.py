@@ -18,13 +18,14 @@ from pathlib import Path as FilePath
 from tempfile import TemporaryDirectory
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from flow.counters import Counters
 from flow.graph import Graph
 from flow.link import LinkError, Record, Tap
 from flow.message import Message
 from flow.replay import Replay, RunReport
+from flow.stage import StrictModel
 from flow.taps import Digest
 from links.dynamixel import Servo
 from links.dynamixel.servo import NOT_LIVE, GoalCommand
@@ -37,10 +38,8 @@ from stages.messages import ServoGoal
 LONGEST_BATCH_NS = 40_000_000  # longer batches are not faster
 
 
-class ClosedLoopSettings(BaseModel):
+class ClosedLoopSettings(StrictModel):
     """Compute time of the host on the vehicle."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     compute_s: float = Field(default=0.02, ge=0.003, le=1)  # from arrival of a record to the goal leaving the host
     killed_s: tuple[float, float] | None = None  # (from, to): grd is not running; it starts again without its state

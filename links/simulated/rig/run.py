@@ -305,11 +305,6 @@ def _scene(scenario: Scenario, truth: Truth) -> Scene:
     )
 
 
-def simulate_records(scenario: Scenario, seed: int | None = None) -> Iterator[Record]:
-    """All records of a scenario, in order of arrival, without a file."""
-    return Simulation(scenario, seed).records()
-
-
 def simulate(
     scenario: FilePath,
     out: FilePath,

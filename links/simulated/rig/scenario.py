@@ -12,10 +12,11 @@ from typing import Any, Literal, Self
 
 import numpy as np
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 
 from flow.config.tree import load_tree, resolve
 from flow.config_error import ConfigError, did_you_mean
+from flow.stage import StrictModel
 from links.simulated.autopilot.autopilot import AutopilotSettings
 from links.simulated.cues.cue_errors import CueSettings
 from links.simulated.pose_sensors.fix_sensor import FixSensorSettings
@@ -43,11 +44,7 @@ OUSTER_STAGGER_DEG = 4.2, 1.4, -1.4, -4.2  # azimuth offsets of an OS1's lasers:
 OPTIONAL_KEYS = ("other_drones", "truth_visible", "lidar_gaps_s")  # written to a scenario file only where used
 
 
-class _ScenarioSettings(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class VehicleSettings(_ScenarioSettings):
+class VehicleSettings(StrictModel):
     """The vehicle: its camera is the origin of the vehicle frame."""
 
     camera_height_m: float = Field(default=1.8, ge=1.0, le=5.0)
@@ -55,7 +52,7 @@ class VehicleSettings(_ScenarioSettings):
     suspension: SuspensionSettings | None = None  # pitch and roll; without it the vehicle stays level
 
 
-class DroneSettings(_ScenarioSettings):
+class DroneSettings(StrictModel):
     """A drone and its path, world frame."""
 
     span_m: float = Field(default=0.5, ge=0.1, le=3.0)
@@ -87,7 +84,7 @@ class RigLidar(rig_lidar.RigLidar):
         return {**values, "beams": beams}
 
 
-class Scenario(_ScenarioSettings):
+class Scenario(StrictModel):
     """A complete scenario. `with_drone` and `changed` make variants."""
 
     version: Literal[1] = 1

@@ -12,17 +12,16 @@ from itertools import pairwise
 from typing import Annotated, Literal, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
+from flow.stage import StrictModel
 from links.simulated.sensors.servo import RPM_RADPS
 
 ARRIVED_RAD = np.radians(0.5)  # distance from the goal at which the script reverses
 
 
-class SweepSegment(BaseModel):
+class SweepSegment(StrictModel):
     """Turn from one end of the travel to the other, `times` times."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     do: Literal["sweep"] = "sweep"
     times: int = Field(default=1, ge=1)
@@ -30,10 +29,8 @@ class SweepSegment(BaseModel):
     ends_deg: tuple[float, float] = (0.0, 180.0)
 
 
-class VibrateSegment(BaseModel):
+class VibrateSegment(StrictModel):
     """Swing about an azimuth: that of the drone, or of a table (t_s since the start of the segment, azimuth_deg)."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     do: Literal["vibrate"] = "vibrate"
     duration_s: float = Field(gt=0)

@@ -13,9 +13,10 @@ from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from flow.link import Record
+from flow.stage import StrictModel
 from links.recording import CompressedImage, encode_compressed_image
 from links.simulated.kernels.ray_casting import Array32
 from links.simulated.sensors.camera_mask import own_body
@@ -45,11 +46,7 @@ CameraMount = Literal["vehicle", "drone"]
 AnyLens = Equidistant | KannalaBrandt | OCam
 
 
-class _Settings(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class CameraMiscalibration(_Settings):
+class CameraMiscalibration(StrictModel):
     """How far the rig file is from the true camera."""
 
     rotation_deg: Vector3 = (0.0, 0.0, 0.0)  # error of the mount: roll, pitch, yaw about the axes of the platform
@@ -75,7 +72,7 @@ def rotated(pose: Pose, rpy_deg: Vector3) -> Pose:
     return Pose(xyz_m=pose.xyz_m, quaternion_xyzw=(x, y, z, w))
 
 
-class CameraSettings(_Settings):
+class CameraSettings(StrictModel):
     """One fisheye camera. The image is square."""
 
     size_px: int = Field(default=720, ge=64, le=1440)
@@ -109,7 +106,7 @@ class CameraSettings(_Settings):
         return Equidistant(focal_px=(self.size_px / 2 - 2) / math.radians(117.5), centre_px=(middle, middle))
 
 
-class CamerasSettings(_Settings):
+class CamerasSettings(StrictModel):
     """The cameras of a scenario; by default none."""
 
     vehicle: CameraSettings | None = None

@@ -14,8 +14,9 @@ import cv2
 import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from flow.stage import StrictModel
 from links.simulated.kernels.camera_image import STEPS, digitise
 from links.simulated.kernels.ray_casting import Array32
 from stages.geometry.frames import Array64
@@ -32,10 +33,8 @@ GHOSTS = (  # position on the line from the centre to the sun, radius as a share
 EDGE_RAD = math.radians(1.5)  # width of the soft rim of the lens
 
 
-class SensorSettings(BaseModel):
+class SensorSettings(StrictModel):
     """The image sensor and its exposure control."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     exposure_ms: float | None = Field(default=None, gt=0, le=60)  # null: automatic
     max_exposure_ms: float = Field(default=15.0, gt=0, le=60)  # limit of the automatic exposure; above it, gain

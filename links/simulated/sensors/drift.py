@@ -15,8 +15,9 @@ Source: ours; orders of magnitude of consumer-grade EKFs with optical flow or wh
 from __future__ import annotations
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from flow.stage import StrictModel
 from links.simulated.kernels.motion import rotations_z
 from links.simulated.world.motion import gauss_markov, interpolate, low_pass, random_walk, rotations_from_vectors
 from stages.geometry.frames import Array64
@@ -25,10 +26,8 @@ STEP_S = 0.01
 SMOOTH_S = 1.0  # time constant of the low-pass on the errors
 
 
-class DriftSettings(BaseModel):
+class DriftSettings(StrictModel):
     """Sizes of the errors. Scale and yaw rate are values, the others one sigma; zero disables an error."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     scale: float = Field(default=0.01, ge=-0.5, le=0.5)  # relative error of distances
     yaw_rate_deg_per_min: float = Field(default=1.0, ge=-600, le=600)

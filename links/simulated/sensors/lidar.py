@@ -14,8 +14,9 @@ from typing import Annotated, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from flow.stage import StrictModel
 from links.lidar import AnyFormat, packet_format
 from links.lidar.ouster import OusterFormat
 from links.simulated.kernels import lidar as kernels
@@ -59,10 +60,8 @@ def _is_dense(footprint: str) -> bool:
     return footprint == "dense"  # scenario files leave out a setting that they do not use
 
 
-class LidarSettings(BaseModel):
+class LidarSettings(StrictModel):
     """Settings and errors of the sensor."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     return_mode: Literal["strongest", "last", "dual"] = "strongest"
     footprint: Annotated[Literal["dense", "sparse"], Field(exclude_if=_is_dense)] = "dense"  # sparse: half the time

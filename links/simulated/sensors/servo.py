@@ -19,9 +19,10 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from flow.link import Record
+from flow.stage import StrictModel
 from links.dynamixel.servo import TICK_RAD, VELOCITY_UNIT_RADPS
 from stages.geometry.frames import Array64, Harmonic
 
@@ -30,10 +31,8 @@ STEP_NS = 1_000_000
 POSITION_GAIN_PER_S = 150.0  # the servo approaches its goal exponentially at this rate
 
 
-class ServoSettings(BaseModel):
+class ServoSettings(StrictModel):
     """The servo and how the host reads it. The defaults have encoder steps as the only error and no command latency."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     speed_limit_rpm: float = Field(default=55.0, gt=0)  # at 12 V
     acceleration_limit_degps2: float = Field(default=6000.0, gt=0)

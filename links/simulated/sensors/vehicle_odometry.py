@@ -12,9 +12,10 @@ import json
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from flow.link import Record
+from flow.stage import StrictModel
 from links.simulated.sensors.drift import STEP_S, DriftingEstimate, DriftSettings
 from links.simulated.world.path import Path
 from links.simulated.world.suspension import SuspendedPath
@@ -35,10 +36,8 @@ class WheelDriftSettings(DriftSettings):
     tilt_deg: float = Field(default=0.2, ge=0, le=20)
 
 
-class VehicleOdometrySettings(BaseModel):
+class VehicleOdometrySettings(StrictModel):
     """Rate, delay and drift of the vehicle's odometry."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     rate_hz: float = Field(default=50.0, ge=1, le=400)
     latency_s: float = Field(default=0.004, ge=0, le=1)

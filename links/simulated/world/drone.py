@@ -10,8 +10,8 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
 
+from flow.stage import StrictModel
 from links.simulated.world.mesh import Mesh, box, merge, quads, rod
 
 BLADES = 2  # per rotor
@@ -20,10 +20,8 @@ Surface = Literal["carbon", "dark_shell", "grey_shell", "light_shell"]
 SPAN_M: dict[Shape, float] = {"x4": 0.5, "folding": 0.35, "hexa": 0.8}  # nominal span of each shape
 
 
-class DroneModel(BaseModel):
+class DroneModel(StrictModel):
     """Shape and surface of the drone. Its span is a separate setting, `drone.span_m`."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     shape: Shape = "x4"
     # reflectivity at 903 nm: 0.12, 0.06, 0.20, 0.60; the LiDAR loses half of the hits near 40, 30, 45, 80 m

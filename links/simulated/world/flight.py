@@ -16,8 +16,9 @@ Source: ours. The cascade is that of the position and attitude controllers of Ar
 from __future__ import annotations
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from flow.stage import StrictModel
 from links.simulated.kernels.motion import GRAVITY_MPS2, STEP_S, fly
 from links.simulated.world.motion import gauss_markov, interpolate
 from links.simulated.world.path import Path
@@ -27,10 +28,8 @@ BEYOND_S = 1.0  # the flight continues this long after the scenario: sensors sam
 SETTLED_S = 60.0  # after this long, all laps of a closed path are flown alike
 
 
-class FlightSettings(BaseModel):
+class FlightSettings(StrictModel):
     """How the drone follows its path."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     attitude_gain_per_s: float = Field(default=8.0, gt=0, le=30)  # turn rate per attitude error
     rate_limit_degps: float = Field(default=220.0, gt=0, le=2000)  # roll and pitch

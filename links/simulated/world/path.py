@@ -12,9 +12,10 @@ from itertools import pairwise
 from typing import Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 from scipy.interpolate import CubicSpline
 
+from flow.stage import StrictModel
 from links.simulated.kernels.motion import DRAG_PER_S, GRAVITY_MPS2, evaluate_cubics, rotations_z
 from stages.geometry.frames import Array64
 
@@ -22,24 +23,20 @@ Spline = Callable[[Array64], tuple[Array64, Array64, Array64]]
 """Value, first and second derivative (n, d) at times (n,)."""
 
 
-class Waypoint(BaseModel):
+class Waypoint(StrictModel):
     """A position at a time after the start, world frame."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     t_s: float = Field(ge=0)
     xyz_m: tuple[float, float, float]
     yaw_deg: float = 0.0  # not wrapped: 350 to 370 is a rotation by 20
 
 
-class Path(BaseModel):
+class Path(StrictModel):
     """A natural cubic spline through the waypoints. A path with one waypoint is static.
 
     With `period_s` the path is closed: it returns to the first waypoint `period_s` after it, at the yaw of the first
     waypoint plus the whole turns that bring it nearest to the yaw of the last one.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     waypoints: tuple[Waypoint, ...] = Field(min_length=1)
     period_s: float | None = Field(default=None, ge=1)

@@ -14,8 +14,9 @@ Source: ours; k and frequency of a passenger car's body (about 3 to 6 deg per g,
 from __future__ import annotations
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from flow.stage import StrictModel
 from links.simulated.kernels.motion import STEP_S, oscillate, rotations_z
 from links.simulated.world.motion import gauss_markov, interpolate, rotations_from_vectors
 from links.simulated.world.path import Path
@@ -26,10 +27,8 @@ ROUGHNESS_TIME_S = 0.1
 ROLLING_MPS = 3.0  # from this speed on, the road roughness is at its full size
 
 
-class SuspensionSettings(BaseModel):
+class SuspensionSettings(StrictModel):
     """Suspension of the vehicle and roughness of the road."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     tilt_deg_per_mps2: float = Field(default=0.45, ge=0, le=5)
     natural_hz: float = Field(default=1.3, gt=0.1, le=10)

@@ -13,8 +13,9 @@ import math
 
 import numpy as np
 from numpy.random import Generator
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from flow.stage import StrictModel
 from stages.geometry.frames import Array64
 
 LIDAR_NM = 903.0
@@ -25,10 +26,8 @@ OVERLAP_M = 3.0  # assumed: below this range the receiver gets (range / OVERLAP_
 CLUTTER_REACH_M = 12.0  # drops beyond this range are too weak to detect
 
 
-class Weather(BaseModel):
+class Weather(StrictModel):
     """The weather of a scenario; the default is a dry, clear day."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     rain_mmph: float = Field(default=0.0, ge=0, le=150)
     visibility_m: float | None = Field(default=None, ge=20)  # where contrast falls to 2 %; null: clear air

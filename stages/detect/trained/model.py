@@ -23,8 +23,9 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
+from flow.stage import StrictModel
 from stages.detect.candidate import Alternative, Candidate
 from stages.detect.trained.features import FEATURES, NAMES, RANGE, TELEMETRY, VERSION
 from stages.geometry.frames import Array64
@@ -54,10 +55,8 @@ class Prediction(NamedTuple):
     contributions: Array64  # (features,) of each feature to log_odds [nats]
 
 
-class Term(BaseModel):
+class Term(StrictModel):
     """g_kj of one alternative and one feature."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     alternative: int = Field(ge=0, lt=len(ALTERNATIVES))
     feature: str
@@ -75,10 +74,8 @@ class Term(BaseModel):
         return self
 
 
-class DetectorModel(BaseModel):
+class DetectorModel(StrictModel):
     """The weights file."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     feature_version: int
     lidar_model: LidarModel = "VLP-16"  # of the runs: return_ratio, existence_nats and scan passes depend on it

@@ -20,8 +20,9 @@ from typing import Annotated
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from flow.stage import StrictModel
 from stages.geometry.frames import Array64
 from stages.geometry.lens import Equidistant, KannalaBrandt, OCam
 from stages.kernels.geometry.so3 import exp_rotation
@@ -41,10 +42,8 @@ STEP_PX = 0.02  # convergence threshold
 NO_TURN: Array64 = np.zeros(3)  # of a camera at rest, or with a global shutter
 
 
-class FeatureSettings(BaseModel):
+class FeatureSettings(StrictModel):
     """Settings of `FeatureTracker`."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     count: int = Field(default=300, ge=20, le=4000)  # cells of the grid inside the lens's circle, one corner each
     max_off_axis_deg: float = Field(

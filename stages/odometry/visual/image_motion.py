@@ -14,8 +14,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from flow.stage import StrictModel
 from stages.geometry.frames import Array64
 from stages.geometry.lens import Equidistant, KannalaBrandt, OCam
 from stages.kernels.geometry.so3 import exp_rotation, log_rotation
@@ -29,14 +30,12 @@ RETURN_RAD = math.radians(1.0)  # above this parallax the camera cannot have ret
 LONGEST_STEP_S = 1.0  # between two images; after a longer gap no rotation is predicted
 
 
-class LinkSettings(BaseModel):
+class LinkSettings(StrictModel):
     """Thresholds for a new key image, noise of a track, errors that tracks share, limit of hypotheses.
 
     `correlation`: chosen so that the NEES from key to key on KITTI 00 is about 3 (2.6); too large on panoramas (0.4).
     `lens_share` is a calibration error of 0.3 px at 300 px from the centre.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     key_parallax_deg: float = Field(default=4.0, gt=0, le=30)  # median over the tracks with parallax
     key_share: float = Field(default=0.4, gt=0, lt=1)  # minimum share of its tracks that are left

@@ -31,7 +31,7 @@ from links.recording import RecordingReader
 from links.runs.request import RunRequest
 from links.simulated.matrix.flights import Cell
 from links.simulated.matrix.matrix import Conditions, scenario_of
-from links.simulated.rig.run import simulate_records
+from links.simulated.rig.run import Simulation
 from stages.messages import RelativePose
 
 sys.path.append(str(Path(__file__).parents[2] / "links" / "mavlink"))
@@ -81,7 +81,7 @@ def test_a_packet_to_its_poses_datagram_by_computing() -> None:
         link = Autopilot(connection=f"udpout:127.0.0.1:{peer.getsockname()[1]}", yaw="measured")
         with link.listen():
             tap.wire(link, peer)
-            for record in simulate_records(scenario):
+            for record in Simulation(scenario).records():
                 begin = time.perf_counter_ns()
                 runner.feed(record)
                 out = tap.took()

@@ -106,11 +106,6 @@ class Quadrotor:
         """Whether it stands or lies on the ground."""
         return bool(self.state[GROUNDED])
 
-    @property
-    def wind_mps(self) -> Array64:
-        """Wind now, world frame."""
-        return self._wind[min(STEPS * self._ticks, len(self._wind) - 1)]
-
     def crash(self) -> None:
         """It has hit an obstacle: it falls with stopped motors."""
         self.state[CRASHED] = 1.0

@@ -7,17 +7,15 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
+
+from flow.stage import StrictModel
 
 Vector = tuple[float, float, float]
 SourceSet = Literal["gps", "external", "external_no_velocity", "external_baro_height", "external_position", "none"]
 
 
-class _StackSettings(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class ImuSettings(_StackSettings):
+class ImuSettings(StrictModel):
     """IMU of the flight controller, 400 Hz, and the low-pass of what it reports (INS_ACCEL_FILTER, INS_GYRO_FILTER).
 
     Biases are those left by the calibration, which ArduPilot subtracts before its EKF and before RAW_IMU; for the gyro
@@ -35,7 +33,7 @@ class ImuSettings(_StackSettings):
     filter_hz: float = Field(default=20.0, ge=5, le=190)
 
 
-class GpsSettings(_StackSettings):
+class GpsSettings(StrictModel):
     """GPS receiver: white noise, a bias that wanders, and delay."""
 
     rate_hz: float = Field(default=5.0, ge=1, le=20)
@@ -49,7 +47,7 @@ class GpsSettings(_StackSettings):
     reported_mps: float = Field(default=0.3, gt=0)
 
 
-class CompassSettings(_StackSettings):
+class CompassSettings(StrictModel):
     """Magnetometer; sigmas of each axis."""
 
     offset_deg: float = Field(default=0.0, ge=-180, le=180)  # of the heading: wrong mounting or declination
@@ -60,7 +58,7 @@ class CompassSettings(_StackSettings):
     white_ut: float = Field(default=0.4, ge=0)
 
 
-class BaroSettings(_StackSettings):
+class BaroSettings(StrictModel):
     """Barometric height."""
 
     white_m: float = Field(default=0.1, ge=0)
@@ -68,7 +66,7 @@ class BaroSettings(_StackSettings):
     bias_time_s: float = Field(default=100.0, gt=1)
 
 
-class WindSettings(_StackSettings):
+class WindSettings(StrictModel):
     """Mean wind and gusts: a first-order Gauss-Markov process per axis."""
 
     mean_world_mps: Vector = (0.0, 0.0, 0.0)
@@ -76,7 +74,7 @@ class WindSettings(_StackSettings):
     gust_time_s: float = Field(default=1.5, gt=0.05, le=60)
 
 
-class Airframe(_StackSettings):
+class Airframe(StrictModel):
     """How the airframe follows its attitude controller, as `links.simulated.world.flight.FlightSettings`."""
 
     attitude_gain_per_s: float = Field(default=8.0, gt=0, le=30)
@@ -87,21 +85,21 @@ class Airframe(_StackSettings):
     tilt_limit_deg: float = Field(default=30.0, gt=0, le=80)  # ANGLE_MAX
 
 
-class FollowPath(_StackSettings):
+class FollowPath(StrictModel):
     """Fly the path of the scenario's drone, from the beginning."""
 
     do: Literal["path"] = "path"
     for_s: float = Field(gt=0)
 
 
-class Hold(_StackSettings):
+class Hold(StrictModel):
     """Hold the present target."""
 
     do: Literal["hold"] = "hold"
     for_s: float = Field(gt=0)
 
 
-class GoTo(_StackSettings):
+class GoTo(StrictModel):
     """Fly to a position in the world frame, as given by the source in use (GPS: by the surveyed map), and hold it."""
 
     do: Literal["go_to"] = "go_to"
@@ -111,7 +109,7 @@ class GoTo(_StackSettings):
     for_s: float = Field(gt=0)
 
 
-class Square(_StackSettings):
+class Square(StrictModel):
     """Fly squares from the present target, along the axes of the estimate's frame, with a stop at each corner."""
 
     do: Literal["square"] = "square"
@@ -120,14 +118,14 @@ class Square(_StackSettings):
     for_s: float = Field(gt=0)
 
 
-class Follow(_StackSettings):
+class Follow(StrictModel):
     """Keep the present offset from the vehicle while it drives; its position is that of its own odometry."""
 
     do: Literal["follow"] = "follow"
     for_s: float = Field(gt=0)
 
 
-class TakeOff(_StackSettings):
+class TakeOff(StrictModel):
     """Arm, when the checks pass, and climb at 1 m/s to a height over the ground; time runs on while not armed."""
 
     do: Literal["take_off"] = "take_off"
@@ -135,7 +133,7 @@ class TakeOff(_StackSettings):
     for_s: float = Field(gt=0)
 
 
-class UseSources(_StackSettings):
+class UseSources(StrictModel):
     """MAV_CMD_SET_EKF_SOURCE_SET of the pilot, at once."""
 
     do: Literal["use_sources"] = "use_sources"
@@ -146,7 +144,7 @@ class UseSources(_StackSettings):
 PlanStep = Annotated[FollowPath | Hold | GoTo | Square | Follow | TakeOff | UseSources, Field(discriminator="do")]
 
 
-class FlightStackSettings(_StackSettings):
+class FlightStackSettings(StrictModel):
     """The autopilot in the loop. Without it the drone follows its path whatever it is sent."""
 
     kind: Literal["ardupilot", "px4"] = "ardupilot"

@@ -11,8 +11,9 @@ from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from flow.stage import StrictModel
 from stages.geometry.frames import Array64
 
 HALF_LENGTH_M = 150.0  # beyond the LiDAR's range from the centre
@@ -36,10 +37,8 @@ def _is_usual(sky: str) -> bool:
     return sky == "usual"  # scenario files leave out a setting that they do not use
 
 
-class SceneSettings(BaseModel):
+class SceneSettings(StrictModel):
     """Surroundings of the vehicle. A setting that does not apply to a kind has no effect."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     kind: Kind = "street"
     road_width_m: float = Field(default=7.5, ge=5, le=30)

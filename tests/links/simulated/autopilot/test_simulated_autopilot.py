@@ -16,7 +16,7 @@ from flow.link import Record
 from links.mavlink import Autopilot as Receiver
 from links.simulated.autopilot.autopilot import Autopilot, AutopilotSettings
 from links.simulated.kernels.motion import GRAVITY_MPS2
-from links.simulated.rig.run import simulate_records
+from links.simulated.rig.run import Simulation
 from links.simulated.rig.scenario import Scenario, load_scenario
 from links.simulated.sensors.drift import DriftSettings
 from links.simulated.world.flight import Flight
@@ -237,19 +237,19 @@ def test_the_same_seed_gives_the_same_bytes_in_any_batches() -> None:
 
 def test_a_scenario_with_autopilot_records_its_flight_and_not_the_path() -> None:
     scenario = load_scenario(STREET).changed(duration_s=0.4)
-    plain = {r.topic for r in simulate_records(scenario)}
-    records = list(simulate_records(scenario.changed(autopilot={}, vehicle_odometry={})))
+    plain = {r.topic for r in Simulation(scenario).records()}
+    records = list(Simulation(scenario.changed(autopilot={}, vehicle_odometry={})).records())
     assert {r.topic for r in records} - plain == {"/autopilot/rx", "/autopilot/tx", "/vehicle/odometry"}
     arrivals = [r.arrival_ns for r in records]
     assert arrivals == sorted(arrivals)
     flown = [r.data for r in records if r.topic == "/truth/drone"]
-    assert flown != [r.data for r in simulate_records(scenario) if r.topic == "/truth/drone"]
+    assert flown != [r.data for r in Simulation(scenario).records() if r.topic == "/truth/drone"]
 
 
 def test_a_suspended_vehicle_tilts_in_the_ground_truth() -> None:
     drive = {"waypoints": [{"t_s": 0, "xyz_m": (0, 0, 0)}, {"t_s": 1, "xyz_m": (8, 0, 0)}]}
     scenario = load_scenario(STREET).changed(duration_s=0.2, vehicle={"path": drive, "suspension": {}})
-    poses = [json.loads(r.data) for r in simulate_records(scenario) if r.topic == "/truth/vehicle"]
+    poses = [json.loads(r.data) for r in Simulation(scenario).records() if r.topic == "/truth/vehicle"]
     assert np.abs([pose["quaternion_xyzw"][:2] for pose in poses]).max() > 1e-4
 
 

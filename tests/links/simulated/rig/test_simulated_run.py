@@ -15,7 +15,7 @@ from flow.link import LinkError, Record
 from links.lidar import Lidar
 from links.recording import RecordingReader
 from links.simulated.rig import run
-from links.simulated.rig.run import Simulation, simulate, simulate_records
+from links.simulated.rig.run import Simulation, simulate
 from links.simulated.rig.scenario import Scenario, load_scenario
 from links.simulated.world.path import Path, Waypoint
 from stages.geometry.frames import LidarMount, Pose, rotation_from_quaternion_xyzw, rotation_z
@@ -96,19 +96,19 @@ def test_the_bytes_put_the_drone_where_the_truth_has_it(short: Scenario) -> None
 
 
 def test_the_same_seed_gives_the_same_bytes_and_another_seed_others(short: Scenario) -> None:
-    first = _hash(list(simulate_records(short, 3)))
-    assert _hash(list(simulate_records(short, 3))) == first
-    assert _hash(list(simulate_records(short, 4))) != first
+    first = _hash(list(Simulation(short, 3).records()))
+    assert _hash(list(Simulation(short, 3).records())) == first
+    assert _hash(list(Simulation(short, 4).records())) != first
 
 
 def test_how_pulses_are_batched_does_not_change_a_byte(short: Scenario, monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = _hash(list(simulate_records(short)))
+    whole = _hash(list(Simulation(short).records()))
     monkeypatch.setattr(run, "BATCH_PACKETS", 7)
-    assert _hash(list(simulate_records(short))) == whole
+    assert _hash(list(Simulation(short).records())) == whole
 
 
 def test_records_are_in_order_of_arrival_and_packets_have_their_own_time(short: Scenario) -> None:
-    records = list(simulate_records(short))
+    records = list(Simulation(short).records())
     arrivals = [r.arrival_ns for r in records]
     assert arrivals == sorted(arrivals)
     assert [r.sequence for r in records] == list(range(len(records)))
@@ -124,7 +124,7 @@ def test_records_are_in_order_of_arrival_and_packets_have_their_own_time(short: 
 
 def test_dual_return_packets_hold_half_the_firings(short: Scenario) -> None:
     dual = short.changed(duration_s=0.1, lidar={"return_mode": "dual"})
-    packets = [r for r in simulate_records(dual) if r.topic == "/lidar/packets"]
+    packets = [r for r in Simulation(dual).records() if r.topic == "/lidar/packets"]
     assert len(packets) == -(-100_000_000 // 663_552)
     lidar = Lidar(slice_ms=0.1)
     kinds = [set(firings.return_kind) for r in packets if (firings := lidar.decode(r)) is not None]

@@ -54,7 +54,7 @@ class Ekf3:
         self._baro: ObservationBuffer[float] = ObservationBuffer()
         self._compass: ObservationBuffer[float] = ObservationBuffer()
         self._external: ObservationBuffer[External] = ObservationBuffer()
-        self._external_ns = self._gps_ns = -NS
+        self._external_ns = -NS
         self._last_external: External | None = None
         self._last_gps: GpsFix | None = None
         self._position_pass_ns = self._velocity_pass_ns = self._height_pass_ns = 0

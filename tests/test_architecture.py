@@ -37,7 +37,7 @@ OUTSIDE = {
     "random",
     "logging",
 }
-MAX_FILES, MIN_LINES = 15, 25
+MAX_FILES, MIN_LINES, MAX_FUNCTION = 15, 25, 60
 TOP_LEVEL = {"flow", "stages", "links", "configs", "deploy", "docs", "recordings", "tests"}
 
 
@@ -135,6 +135,17 @@ def test_folders_have_at_most_15_files_and_files_at_least_25_lines():
         if file.name != "__init__.py" and len(file.read_text(encoding="utf-8").splitlines()) < MIN_LINES
     }
     assert not small, f"under {MIN_LINES} lines: {sorted(small)}"
+
+
+def test_functions_outside_compiled_code_have_at_most_60_lines():
+    for package in PACKAGES:
+        for file in sources(package):
+            if "kernels" in file.parts:
+                continue
+            for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+                if isinstance(node, ast.FunctionDef):
+                    lines = (node.end_lineno or 0) - node.lineno + 1
+                    assert lines <= MAX_FUNCTION, f"{file}:{node.lineno}: {node.name} has {lines} lines"
 
 
 def test_the_top_level_is_fixed():

@@ -62,5 +62,13 @@ def test_the_readme_fits_a_page_and_its_lines_a_screen():
     assert [line for line in lines if len(line) > 120] == []
 
 
+def test_prose_of_guides_fits_a_screen():
+    """Tables, code and images may be wider."""
+    for file in [*(ROOT / "docs" / "how-to").glob("*.md"), *(ROOT / "deploy").glob("*.md")]:
+        lines = file.read_text(encoding="utf-8").splitlines()
+        long = [line for line in lines if len(line) > 120 and not line.startswith(("|", "    ", "!["))]
+        assert long == [], name_of(file)
+
+
 def test_the_changelog_has_the_released_version():
     assert f"## [{__version__}]" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")

@@ -17,8 +17,11 @@ from links.runs.shipped import shipped, shipped_all
 from stages.geometry.lidar_models import LIDAR_MODELS
 
 if TYPE_CHECKING:  # the simulator is an optional dependency
+    from types import ModuleType
+
     from links.simulated.matrix.flights import Cell
     from links.simulated.matrix.making import MatrixReport
+    from links.simulated.matrix.matrix import Conditions
 
 JobsOption = Annotated[
     int, typer.Option("--jobs", min=1, max=256, help="Number of processes; it does not affect the results.")
@@ -143,29 +146,19 @@ def simulate_matrix(
 
     Example: grd matrix out/matrix --only '*-empty-*' --closed-loop configs/sim.yaml --results out/runs --jobs 2
     """
-    try:
-        from links.simulated.matrix.making import make_matrix
-        from links.simulated.matrix.matrix import Conditions
-    except ModuleNotFoundError as missing:
-        raise not_installed(missing) from None
-
-    if results is not None and closed_loop is None:
-        raise LinkError("--results keeps the runs of a closed loop: add --closed-loop CONFIG")
+    _check_options(lidar, closed_loop, results)
     _check_cameras(cameras_hz, {"--images": images, "--pixels": cameras_px, "--readout": readout_ms})
     selected = _cells(folder, only or ["*"], pairs)
     if list_only:
-        for cell in selected:
-            out.print(cell.name, markup=False)
+        out.print("\n".join(cell.name for cell in selected), markup=False)
         return
-    if lidar not in LIDAR_MODELS:
-        raise LinkError(f"--lidar {lidar}: not one of {', '.join(LIDAR_MODELS)}")
-    conditions = Conditions(
+    conditions = _matrix().Conditions(
         calibrated=calibrated,
         odometry=odometry,
         rain=rain,
         autopilot=autopilot,
         cameras_hz=cameras_hz,
-        cameras_px=cameras_px or Conditions.cameras_px,
+        cameras_px=cameras_px or _matrix().Conditions.cameras_px,
         readout_ms=readout_ms or 0.0,
         lidar=lidar,
         perturbed=perturbed,
@@ -174,10 +167,41 @@ def simulate_matrix(
         clutter=clutter,
     )
     several = range(first_seed, first_seed + seeds)
-    with progress_bar(f"{len(selected) * seeds} recordings") as step:
-        report = make_matrix(
-            folder, selected, several, closed_loop, step, conditions, results, scheduler or jobs, images
-        )
+    _make(folder, selected, several, closed_loop, conditions, results, scheduler or jobs, images)
+
+
+def _matrix() -> ModuleType:
+    """The module of the matrix. LinkError when the simulator is not installed."""
+    try:
+        from links.simulated.matrix import matrix
+    except ModuleNotFoundError as missing:
+        raise not_installed(missing) from None
+    return matrix
+
+
+def _check_options(lidar: str, closed_loop: Path | None, results: Path | None) -> None:
+    """LinkError for an unknown LiDAR, and for runs to keep without a closed loop."""
+    if lidar not in LIDAR_MODELS:
+        raise LinkError(f"--lidar {lidar}: not one of {', '.join(LIDAR_MODELS)}")
+    if results is not None and closed_loop is None:
+        raise LinkError("--results keeps the runs of a closed loop: add --closed-loop CONFIG")
+
+
+def _make(
+    folder: Path,
+    selected: list[Cell],
+    seeds: range,
+    closed_loop: Path | None,
+    conditions: Conditions,
+    results: Path | None,
+    workers: int | str,
+    images: Path | None,
+) -> None:
+    """Make the recordings, print the summary, and exit with its code."""
+    from links.simulated.matrix.making import make_matrix
+
+    with progress_bar(f"{len(selected) * len(seeds)} recordings") as step:
+        report = make_matrix(folder, selected, seeds, closed_loop, step, conditions, results, workers, images)
     _report(folder, report)
 
 
@@ -190,9 +214,7 @@ def _check_cameras(cameras_hz: float | None, of_cameras: dict[str, object]) -> N
 
 def _cells(folder: Path, patterns: list[str], pairs: bool) -> list[Cell]:
     """The cells whose name matches. LinkError when none does."""
-    from links.simulated.matrix.matrix import cells
-
-    selected = cells(patterns, pairs)
+    selected: list[Cell] = _matrix().cells(patterns, pairs)
     if not selected:
         names = " or ".join(f"'{pattern}'" for pattern in patterns)
         few = " among the pairs" if pairs else ""

@@ -11,6 +11,7 @@ from links.mavlink.profiles import ProfileName, YawOutput, findings, required_pa
 FOLDER = Path(__file__).resolve().parents[1] / "deploy" / "parameters"
 FILES: dict[str, tuple[ProfileName, YawOutput]] = {
     "ardupilot_gps.param": ("ardupilot", "none"),
+    "ardupilot_gps_yaw.param": ("ardupilot", "measured"),
     "ardupilot_no_gps.param": ("ardupilot", "measured"),
     "px4_gps.params": ("px4", "none"),
     "px4_no_gps.params": ("px4", "measured"),

@@ -7,6 +7,7 @@ The switch to grd's set is requested (MAV_CMD_SET_EKF_SOURCE_SET) while all of t
     poses have been sent for MIN_SENDING_NS, and the newest contains a LiDAR position of the last second
     its EKF reports its state, and no test ratio of position or velocity above MAX_RATIO
     the poses move as its own estimate does (`poses/agreement.py`), unless its EKF has no position to compare
+    it is slow enough for the turn of the axes, see below
 
 A request that is denied, or that is not acknowledged three times, is not repeated until the autopilot boots. Nor is any
 after somebody else has selected another set: ArduPilot names a set that its remote control selects in a STATUSTEXT. It
@@ -16,6 +17,11 @@ Set 1 is requested FALLBACK_AFTER_NS after the last pose, once a second until it
 from another source than grd. ArduPilot alone does not return to it. Without a connection, or after the end of grd,
 nothing is requested: the pilot has to switch. Neither does grd that was restarted in flight request set 1 before it has
 requested its own set again, because it does not know which set is in use.
+
+Poses with yaw are in axes that are not the autopilot's. With the source of the yaw the EKF turns its axes, but not its
+velocity: NavEKF3_core::SelectVelPosFusion resets the position alone, and a velocity that is wrong by less than the gate
+(5 sigma, some 4 m/s) is not reset either but flown with. So no set is requested, set 1 neither, while the velocity in
+the turned axes would be wrong by more than MAX_TURNED_MPS.
 
 Source: ours; ArduPilot GCS_MAVLINK::handle_command_set_ekf_source_set, RC_Channel::do_aux_function (EKF_SOURCE_SET),
 ArduCopter mode.h (numbers of modes), NavEKF3_core::send_status_report.
@@ -31,6 +37,7 @@ from typing import Any
 from links.mavlink.commands import ACCEPTED, ACK_TIMEOUT_NS, IN_PROGRESS, TEMPORARILY_REJECTED, command_long, is_answer
 from links.mavlink.poses.agreement import MotionAgreement
 from links.mavlink.poses.autopilot_estimate import AutopilotEstimate
+from links.mavlink.poses.odom_frame import odom_yaw_rad
 from links.mavlink.profiles import EXTERNAL, RequiredParameter, findings
 from links.mavlink.readers import CONSTANT_POSITION, HORIZONTAL_RELATIVE
 from links.mavlink.transport.framing import dialect
@@ -45,6 +52,7 @@ FALLBACK_AFTER_NS = 500_000_000  # without a pose; ArduPilot times out after 0.3
 MAX_FIX_AGE_NS = 1_000_000_000  # age of the LiDAR position in a pose
 MAX_STATUS_AGE_NS = 2_000_000_000  # age of the EKF's status
 MAX_RATIO = 0.5  # test ratio; above 1 the EKF rejects
+MAX_TURNED_MPS = 1.0  # ours: an error of velocity that position control removes within a few metres
 TRIES = 3
 PARAMETER_PERIOD_NS, PARAMETER_RETRY_PERIOD_NS = 200_000_000, 10_000_000_000  # of requests, and after TRIES of each
 USING = re.compile(r"Using EKF Source Set (\d)")
@@ -78,6 +86,9 @@ class SourceSwitch:
         self._armed, self._mode = False, -1
         self._status: tuple[int, Any] | None = None  # arrival and message
         self._position_ns = 0  # newest LOCAL_POSITION_NED
+        self._speed_mps = 0.0  # of it, horizontal
+        self._turn_rad = 0.0  # from the autopilot's axes by its own sources to those of the poses
+        self._too_fast = False  # set 1 is due, see `_is_slow`
         self._blocked = ""  # why grd's set is not requested any more
         self._pending: tuple[int, int] | None = None  # the set requested, and when
         self._tries = 0
@@ -107,7 +118,7 @@ class SourceSwitch:
         elif kind == "EKF_STATUS_REPORT":
             self._status = arrival_ns, message
         elif kind == "LOCAL_POSITION_NED":
-            self._position_ns = arrival_ns
+            self._position_ns, self._speed_mps = arrival_ns, math.hypot(message.vx, message.vy)
         elif kind == "PARAM_VALUE" and message.param_id in self._missing():
             self._values[message.param_id] = float(message.param_value)
         elif kind == "STATUSTEXT":
@@ -122,7 +133,9 @@ class SourceSwitch:
         if self._sending_ns is None or now_ns - self._sent_ns > FALLBACK_AFTER_NS:
             self._sending_ns = now_ns
             self.agreement.restart()
-        self._sent, self._sent_ns = pose, now_ns
+        self._sent, self._sent_ns, self._too_fast = pose, now_ns, False
+        if self.active == FIRST_SET and pose.odom_yaw_rad is None:
+            self._turn_rad = odom_yaw_rad(pose, autopilot) or 0.0
         off_m = self.agreement.add(pose, autopilot)
         if off_m is not None and self.active != self._set:
             self._warn(f"pose and autopilot differ by {off_m:.1f} m")
@@ -135,7 +148,11 @@ class SourceSwitch:
             return self._repeated(*self._pending, now_ns)
         ended = self._sent is not None and now_ns - self._sent_ns > FALLBACK_AFTER_NS
         if self.active == self._set and ended and self._can_fall_back():
-            return self._request(FIRST_SET, now_ns)
+            if self._is_slow():
+                return self._request(FIRST_SET, now_ns)
+            if not self._too_fast:
+                self._too_fast = True
+                self._warn("too fast for source set 1: slow down")
         if self._missing():
             return self._parameter_request(now_ns)
         if self.active != self._set and not self._blocked and self._is_ready(now_ns):
@@ -158,7 +175,7 @@ class SourceSwitch:
             return False
         if pose.measured_ns is None or pose.stamp_ns - pose.measured_ns > MAX_FIX_AGE_NS:
             return False
-        if findings(self._required, self._values):
+        if findings(self._required, self._values) or not self._is_slow():
             return False
         if self._status is None or now_ns - self._status[0] > MAX_STATUS_AGE_NS:
             return False
@@ -168,6 +185,10 @@ class SourceSwitch:
             return False
         has_position = status.flags & HORIZONTAL_RELATIVE and not status.flags & CONSTANT_POSITION
         return self.agreement.agrees(now_ns) if has_position else now_ns - self._position_ns > MAX_STATUS_AGE_NS
+
+    def _is_slow(self) -> bool:
+        """Whether the velocity that the EKF keeps is nearly right in the axes of the other set."""
+        return 2.0 * abs(math.sin(0.5 * self._turn_rad)) * self._speed_mps < MAX_TURNED_MPS
 
     def _can_fall_back(self) -> bool:
         """Whether set 1 has a position of another source than grd."""

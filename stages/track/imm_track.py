@@ -51,6 +51,7 @@ class _Track:
     number: int
     filter: ImmPdaf
     start_m: Array64
+    returns: int  # of the newest cluster
     hits: int = 1
     seen_ns: int = 0
     confirmed: bool = False
@@ -132,7 +133,7 @@ class ImmPdafTrack(Stage[ImmPdafTrackSettings]):
         for cluster in clusters:
             now.number += 1
             filter_ = ImmPdaf(cluster.xyz_map_m, cluster.stamp_ns, self._filter_settings)
-            now.tracks.append(_Track(now.number, filter_, cluster.xyz_map_m, seen_ns=cluster.stamp_ns))
+            now.tracks.append(_Track(now.number, filter_, cluster.xyz_map_m, cluster.returns, seen_ns=cluster.stamp_ns))
         now.tracks = [track for track in now.tracks if end_ns - track.seen_ns < self._retention_ns(track)]
         best = next((track for track in now.tracks if track.confirmed), None)
         now.published = 0 if best is None else best.number
@@ -146,8 +147,8 @@ class ImmPdafTrack(Stage[ImmPdafTrackSettings]):
         seen = best.filter.stamp_ns >= end_ns - round(frame_s * 1e9)
         reason = f"{best.hits} frames, probability of a manoeuvre {best.filter.probabilities[1]:.2f}"
         yield TrackState(
-            stamp_ns=end_ns, state=TrackingState.TRACKING, reason=reason, hits=int(seen), frame_s=frame_s,
-            track_id=best.number,
+            stamp_ns=end_ns, state=TrackingState.TRACKING, reason=reason, hits=best.returns if seen else 0,
+            frame_s=frame_s, track_id=best.number,
         )  # fmt: skip
         if seen:
             yield self._fix(best)
@@ -159,7 +160,7 @@ class ImmPdafTrack(Stage[ImmPdafTrackSettings]):
             stamp_ns=track.filter.stamp_ns,
             xyz_vehicle_m=R.T @ (xyz_m - t),
             covariance_m2=R.T @ covariance_m2 @ R,
-            hits=1,
+            hits=track.returns,
             track_id=track.number,
         )
 
@@ -198,10 +199,10 @@ class ImmPdafTrack(Stage[ImmPdafTrackSettings]):
                 near[index] = distance_m
         if not near:
             return clusters
-        stamp_ns = clusters[min(near, key=lambda index: near[index])].stamp_ns
-        if not track.filter.step(np.array([clusters[index].xyz_map_m for index in near]), stamp_ns):
+        nearest = clusters[min(near, key=lambda index: near[index])]
+        if not track.filter.step(np.array([clusters[index].xyz_map_m for index in near]), nearest.stamp_ns):
             return clusters
-        track.hits, track.seen_ns = track.hits + 1, stamp_ns
+        track.hits, track.seen_ns, track.returns = track.hits + 1, nearest.stamp_ns, nearest.returns
         xyz_m, _, _ = track.filter.estimate()
         moved_m = math.dist(xyz_m, track.start_m)
         track.confirmed |= track.hits >= self.settings.confirm_hits and moved_m >= self.settings.least_moved_m

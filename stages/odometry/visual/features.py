@@ -25,7 +25,6 @@ from pydantic import Field
 from flow.stage import StrictModel
 from stages.geometry.frames import Array64
 from stages.geometry.lens import Equidistant, KannalaBrandt, OCam
-from stages.kernels.geometry.so3 import exp_rotation
 from stages.kernels.visual import patches
 from stages.kernels.visual.features import best_per_cell
 from stages.kernels.visual.patches import Array32, Grey
@@ -214,9 +213,14 @@ class FeatureTracker:
 
 
 def at_middle_row(ray: Array64, rows_after: Array64, turn_rad_per_row: Array64) -> Array64:
-    """Rays (n, 3) of rows exposed `rows_after` (n,) the middle one, in the camera axes of the middle row."""
-    turns = rows_after[:, None] * turn_rad_per_row
-    return np.array([exp_rotation(turn) @ r for turn, r in zip(turns, ray, strict=True)]).reshape(-1, 3)
+    """Rays (n, 3) of rows exposed `rows_after` (n,) the middle one, in the camera axes of the middle row.
+
+    `turn_rad_per_row` (3,) is the camera's rotation from one row to the next, camera axes; it must not be zero.
+    """
+    rate = float(np.linalg.norm(turn_rad_per_row))
+    axis, angle = turn_rad_per_row / rate, (rate * rows_after)[:, None]
+    along = (ray @ axis)[:, None] * axis
+    return along + np.cos(angle) * (ray - along) + np.sin(angle) * np.cross(axis, ray)  # Rodrigues
 
 
 def usable_pixels(lens: Equidistant | KannalaBrandt | OCam, settings: FeatureSettings, shape: tuple[int, int]) -> Grey:

@@ -49,6 +49,7 @@ class Flight:
         self.poses = self.armed = True
         self.mode, self.ratio, self.flags = 5, 0.1, POSITION
         self.yaw_error_rad, self.compass_rad = 0.0, 0.0
+        self.turn_rad = 0.0  # of map against the autopilot's axes
         self.measured = True
         self.own_speed_mps = 1.0
         self.autopilot = AutopilotEstimate()
@@ -78,7 +79,9 @@ class Flight:
             give(message)
         if self.poses:
             pose = good_pose(
-                self.now_ns, xyz_map_m=np.array([x_m, 2.0, 10.0]), R_map_drone=rotation_z(self.yaw_error_rad)
+                self.now_ns,
+                xyz_map_m=rotation_z(self.turn_rad) @ [x_m, 2.0, 10.0],
+                R_map_drone=rotation_z(self.turn_rad + self.yaw_error_rad),
             )
             measured_ns = self.now_ns if self.measured else self.now_ns - 2_000 * MS
             pose = dataclasses.replace(pose, odom_yaw_rad=None, measured_ns=measured_ns)
@@ -358,4 +361,39 @@ def test_a_flight_is_switched_to_grd_and_back_to_gps_when_the_lidar_ends(tmp_pat
     stack = simulation.flight.stack
     events = [str(event) for event in stack.events]
     assert events == ["plan: path", "source set 2", "source set 1"]
+    assert not stack.quadrotor.crashed
+
+
+def test_a_set_is_requested_only_while_the_velocity_in_the_turned_axes_is_nearly_right():
+    flight = Flight()
+    flight.turn_rad = math.radians(90)
+    assert flight.fly(20).requested == []  # 1 m/s, wrong by 1.4 m/s
+    flight = Flight()
+    flight.turn_rad = math.radians(50)
+    assert flight.fly(10).requested == [2]  # 0.8 m/s
+    flight.poses, flight.own_speed_mps = False, 2.0
+    assert flight.fly(5).requested == [2]
+    assert flight.texts[1:] == ["too fast for source set 1: slow down"]
+    flight.own_speed_mps = 0.5
+    assert flight.fly(1).requested == [2, 1]
+
+
+def test_a_flight_that_follows_the_vehicle_at_speed_is_not_switched_to_gps_in_turned_axes():
+    config = ROOT / "configs/sim_flight_switch_fixes.yaml"
+    scenario = load_scenario(ROOT / "configs/scenarios/flight/follow_fixes.yaml")
+    assert scenario.autopilot is not None
+    autopilot = scenario.autopilot.model_dump()
+    autopilot["flight_stack"]["plan"] = [
+        {"do": "path", "for_s": 20},
+        {"do": "square", "for_s": 11, "side_m": 8.0},
+        {"do": "follow", "for_s": 20},
+    ]
+    autopilot["flight_stack"]["source_sets"] = ["gps", "external_no_velocity"]
+    scenario = scenario.changed(duration_s=40.0, autopilot=autopilot, lidar_gaps_s=((34.0, 40.0),))
+    simulation = Simulation(scenario, loop=load_loop(config, scenario.rig_yaml(), "test", scenario.closed_loop))
+    for _ in simulation.records():
+        pass
+    assert simulation.flight is not None
+    stack = simulation.flight.stack
+    assert [str(event) for event in stack.events] == ["plan: path", "plan: square", "source set 2", "plan: follow"]
     assert not stack.quadrotor.crashed

@@ -51,6 +51,8 @@ def test_a_small_object_that_moves_is_followed():
     assert errors_m(fixes, (2.0, 0.5, 0.0)).max() < 0.3
     assert states[-1].state is TrackingState.TRACKING
     assert len({fix.track_id for fix in fixes}) == 1
+    assert {fix.hits for fix in fixes} == {3}
+    assert {state.hits for state in states} == {0, 3}
     assert np.linalg.eigvalsh(fixes[-1].covariance_m2).min() > 0
 
 

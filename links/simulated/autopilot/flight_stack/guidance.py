@@ -122,13 +122,12 @@ class Guidance:
         self._leg(self._from + corners[leg % 4], self._from + corners[(leg + 1) % 4], step.speed_mps, since_s % leg_s)
 
     def _follow(self, time_s: float, frame: SurveyFrame) -> None:
-        times = np.array([self._begin_s, time_s])
-        position, velocity, _, _ = self._vehicle.at(times)
-        drift = self._drift_m(time_s)
-        moved = position[1] - position[0] + drift - self._drift_m(self._begin_s)
-        drifting = (drift - self._drift_m(time_s - TICK_S)) / TICK_S
-        self.target.xyz_m = self._from + rotate(moved, frame.yaw_rad)
-        self.target.velocity_mps = rotate(velocity[1] + drifting, frame.yaw_rad)
+        """The target moves with the vehicle, tick by tick: the axes of the estimate may turn."""
+        before_s = max(self._begin_s, time_s - TICK_S)
+        position, velocity, _, _ = self._vehicle.at(np.array([before_s, time_s]))
+        drifted = self._drift_m(time_s) - self._drift_m(before_s)
+        self.target.xyz_m = self.target.xyz_m + rotate(position[1] - position[0] + drifted, frame.yaw_rad)
+        self.target.velocity_mps = rotate(velocity[1] + drifted / TICK_S, frame.yaw_rad)
 
 
 class PositionController:

@@ -50,6 +50,7 @@ NS = 1_000_000_000
 TICK_NS = round(TICK_S * NS)
 GUIDED, LAND = 4, 9  # custom modes of ArduCopter
 BOOT_S = 2.0  # a reboot is silent for so long
+RESET_S = 1.0  # after a change of sources; then the frame is theirs, reset or not
 ORIGIN = (356_895_000, 1_396_917_000, 40_000)  # latitude, longitude [1e-7 deg], altitude [mm] of the first GPS fix
 
 
@@ -103,6 +104,7 @@ class FlightStack:
         self._reboots, self._jumps = deque(sorted(s.reboot_s)), deque(sorted(s.estimate_resets_m))
         self._next = {"check": 0.0, "arm": 0.0}
         self._switched_s = -10.0
+        self._frame_before: SurveyFrame | None = None  # of the sources of before, until the estimate is reset
         self.target_error_m = self.worst_target_error_m = 0.0  # distance of the true position from the true target
         self._texts: set[str] = set()
 
@@ -140,9 +142,10 @@ class FlightStack:
 
     def use_sources(self, number: int) -> bool:
         """See Vehicle."""
+        frame = self._frame()
         if not self.ekf.use_set(number - 1):
             return False
-        self._switched_s = self._tick * TICK_S
+        self._switched_s, self._frame_before = self._tick * TICK_S, frame
         self.text(6, f"Using EKF Source Set {number}")
         self._note(EventKind.SOURCE_SET, number=number)
         return True
@@ -190,6 +193,8 @@ class FlightStack:
         self.ekf.in_flight = self.armed and not self.quadrotor.grounded
         for jump, yaw in self.ekf.take_resets():
             self._guidance.shift(jump, yaw)
+            if np.any(jump):
+                self._frame_before = None
         if self.ekf.has_origin and self.origin is None:
             self.origin = ORIGIN
             send_origin(self, device_ns)
@@ -218,11 +223,13 @@ class FlightStack:
             climb = -LAND_FAST_MPS if above_m > LAND_FAST_ABOVE_M else -LAND_MPS
             yaw = math.atan2(2 * estimate[8] * estimate[9], 1 - 2 * estimate[8] ** 2)
             return self._controller.land(climb, estimate[3:6], yaw, False)
-        target = self._guidance.update(time_s, self._frame())
+        if time_s > self._switched_s + RESET_S:
+            self._frame_before = None
+        target = self._guidance.update(time_s, self._frame_before or self._frame())
         if self._climbing_to is not None:
             target.xyz_m[2] = min(target.xyz_m[2] + 1.0 * TICK_S, self._climbing_to)
         frame = self._frame()
-        if time_s > self._switched_s + 1.0:  # until the estimate is reset, the target is in the frame of before
+        if time_s > self._switched_s + RESET_S:  # until the estimate is reset, the target is in the frame of before
             away = rotate(target.xyz_m - frame.xyz_m, -frame.yaw_rad) - self.quadrotor.state[0:3]
             if self.ekf.sources.position is AidingSource.EXTERNAL:
                 away -= self._drift_m(time_s)

@@ -9,7 +9,7 @@ from pydantic import ValidationError
 from stages.kernels.geometry.so3 import exp_rotation
 from stages.kernels.visual.features import best_per_cell
 from stages.kernels.visual.patches import RADIUS_PX, SIDE_PX, at, find, sample, take
-from stages.odometry.visual.features import FeatureSettings, FeatureTracker, usable_pixels
+from stages.odometry.visual.features import FeatureSettings, FeatureTracker, at_middle_row, usable_pixels
 from tests.stages.seen import LENS, PIXEL_RAD, SIZE_PX, grey_image
 
 
@@ -166,3 +166,13 @@ def test_a_template_is_matched_at_sub_pixel_positions_inside_the_image_only():
             assert np.isnan(wanted).any()
     assert 100 < beyond < 400
     assert not sample(grey, np.nan, 20.0, np.eye(2), seen)
+
+
+def test_rays_of_a_turning_camera_are_corrected_to_the_exposure_of_the_middle_row():
+    rng = np.random.default_rng(0)
+    still = rng.normal(size=(50, 3))  # directions of the scene in the camera axes of the middle row
+    still /= np.linalg.norm(still, axis=1)[:, None]
+    rows_after, turn = rng.uniform(-300.0, 300.0, 50), np.radians([0.02, -0.03, 0.05])  # 18 deg at the last row
+    seen = np.array([exp_rotation(k * turn).T @ ray for k, ray in zip(rows_after, still, strict=True)])
+    assert np.linalg.norm(seen - still, axis=1).max() > 0.1
+    np.testing.assert_allclose(at_middle_row(seen, rows_after, turn), still, atol=1e-12)

@@ -85,8 +85,9 @@ class FlightOutcome:
         self._poses = SentPoses(truth, odometry, stack.north_yaw_of_map)
 
     def on_sent(self, record: Record) -> None:
-        """A frame to the autopilot."""
-        self._poses.add(record)
+        """A frame to the autopilot; after a crash none counts: the simulated IMU does not feel the impact."""
+        if not self._stack.quadrotor.crashed:
+            self._poses.add(record)
 
     def is_over(self) -> bool:
         """Check the path since the last call for collisions and fly-aways; True: the flight was lost some time ago."""

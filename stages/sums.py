@@ -6,7 +6,8 @@ From 3.12 on the built-in `sum` compensates the rounding error of each addition;
     sum_in_order([0.1] * 10)  0.9999999999999999
 
 Stages add floats with `sum_in_order`, so that a recording has one output hash. Sums of NumPy arrays, of NumPy scalars
-and in compiled code do not depend on the version of Python.
+and in compiled code do not depend on the version of Python, and neither do sums of integers: these keep the built-in
+`sum`.
 
 Source: Python documentation, "What's New In Python 3.12", built-in functions.
 """

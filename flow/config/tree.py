@@ -14,6 +14,7 @@ Source: ours. The bounds of a file are those of `yaml_text`; those of all refere
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -143,8 +144,7 @@ def _read(file: Path, tree: Tree, including: tuple[Path, ...]) -> Tree:
         with file.open("rb") as stream:
             data = stream.read(MAX_FILE_BYTES + 1)
     except FileNotFoundError:
-        near = did_you_mean(file.name, [p.name for p in file.parent.glob("*.y*ml")]) if file.parent.is_dir() else ""
-        return failed(f"no such file.{near}")
+        return failed(f"no such file.{_similar_file(file)}")
     except OSError as error:
         return failed(f"cannot be read: {error.strerror}.")
     try:
@@ -174,12 +174,19 @@ def _read(file: Path, tree: Tree, including: tuple[Path, ...]) -> Tree:
         if target.resolve() in chain:
             tree.errors.append(ErrorDetail(location, "include", f"'{name}' includes itself."))
         elif not target.is_file():
-            near = did_you_mean(name, [p.name for p in file.parent.glob("*.y*ml") if p != file])
+            near = _similar_file(target)
             tree.errors.append(ErrorDetail(location, "include", f"no such file '{name}'.{near}"))
         else:
             _merge(below, _read(target, tree, chain))
     _merge(below, own)
     return below
+
+
+def _similar_file(file: Path) -> str:
+    """` Did you mean 'x.yaml'?` for the YAML file beside `file` whose name is the most similar, or nothing."""
+    names = {p.stem: p.name for p in file.parent.glob("*.y*ml")} if file.parent.is_dir() else {}
+    found = difflib.get_close_matches(file.stem, names, n=1)
+    return f" Did you mean '{names[found[0]]}'?" if found else ""
 
 
 def _tree_of_text(text: YamlText, file: str, above: KeyPath = ()) -> Tree:

@@ -7,13 +7,21 @@ Source: ours.
 
 from __future__ import annotations
 
+import os
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import import_module
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
+from flow.config_error import did_you_mean
 from links import __version__
+
+LOADING_LINE_AFTER_S = 1.0
+COMPLETION = "_GRD_COMPLETE"  # set by the shell when it asks for completions
 
 # name: module and function in links.cli, beginning of the help
 COMMANDS = {
@@ -57,7 +65,11 @@ class Commands(TyperGroup):
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """The command of this name; None when there is none."""
-        return command(cmd_name) if cmd_name in COMMANDS else super().get_command(ctx, cmd_name)
+        if cmd_name in COMMANDS:
+            return command(cmd_name)
+        if not ctx.resilient_parsing:  # that of completions
+            ctx.fail(f"No such command '{cmd_name}'.{did_you_mean(cmd_name, COMMANDS)}")
+        return super().get_command(ctx, cmd_name)
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """The list of commands in the help."""
@@ -69,8 +81,23 @@ def command(name: str) -> Any:
     """A command, after its module was imported."""
     module, _, function = COMMANDS[name][0].partition(":")
     one = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
-    one.command(name)(getattr(import_module(module if "." in module else f"links.cli.{module}"), function))
+    with _loading_line():
+        one.command(name)(getattr(import_module(module if "." in module else f"links.cli.{module}"), function))
     return typer.main.get_command(one)
+
+
+@contextmanager
+def _loading_line() -> Iterator[None]:
+    """A line on stderr when an import takes long: a disk that has not read it yet, or kernels to compile."""
+    text = "loading; a first run also compiles its kernels, which takes some minutes"
+    timer = threading.Timer(LOADING_LINE_AFTER_S, typer.echo, (text,), {"err": True})
+    timer.daemon = True
+    if COMPLETION not in os.environ:
+        timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 app = typer.Typer(

@@ -65,60 +65,63 @@ def report_errors(command: F) -> F:
 
 @contextmanager
 def progress_bar(label: str, *, at_once: bool = False) -> Iterator[Callable[[float, float], None]]:
-    """`with progress_bar("replay") as step: step(done, total)`: a bar on stderr, shown after BAR_DELAY_S.
+    """`with progress_bar("replay") as step: step(done, total)`: progress on stderr, however long a step takes.
 
-    `at_once`: shown from the start, also in a log: a line now and every LINE_PERIOD_S, however long a step takes.
+    A bar on a terminal; in a log a line, and one more every LINE_PERIOD_S. The first appears after BAR_DELAY_S, or
+    `at_once`.
     """
-    if at_once and not err.is_terminal:
-        with _progress_lines(label) as line_step:
-            yield line_step
-        return
-    begin = time.monotonic()
-    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
-    bar = Progress(*columns, console=err, transient=True, refresh_per_second=5)
-    task = bar.add_task(label, total=None)
-    shown = at_once
-    if at_once:
-        bar.start()
-
-    def step(done: float, total: float) -> None:
-        nonlocal shown
-        if not shown:
-            if time.monotonic() - begin < BAR_DELAY_S:
-                return
-            bar.start()
-            shown = True
-        bar.update(task, completed=done, total=total)
-
-    try:
-        yield step
-    finally:
-        if shown:
-            bar.stop()
-
-
-@contextmanager
-def _progress_lines(label: str) -> Iterator[Callable[[float, float], None]]:
-    """Progress as lines of a log."""
-    begin_s, ended, share = time.monotonic(), threading.Event(), [0.0]
+    progress = _ProgressBar(label) if err.is_terminal else _ProgressLines(label)
+    ended = threading.Event()
 
     def show() -> None:
-        while True:
-            percent = f", {100 * share[0]:.0f} %" if share[0] else ""
-            err.print(f"{label}: {time.monotonic() - begin_s:.0f} s{percent}", markup=False)
-            if ended.wait(LINE_PERIOD_S):
-                return
-
-    def step(done: float, total: float) -> None:
-        share[0] = done / total if total else 0.0
+        if not at_once and ended.wait(BAR_DELAY_S):
+            return
+        progress.show(ended)
 
     thread = threading.Thread(target=show, name="progress", daemon=True)
     thread.start()
     try:
-        yield step
+        yield progress.step
     finally:
         ended.set()
         thread.join()
+
+
+class _ProgressBar:
+    """Progress as a bar that vanishes at the end."""
+
+    def __init__(self, label: str) -> None:
+        columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+        self._bar = Progress(*columns, console=err, transient=True, refresh_per_second=5)
+        self._task = self._bar.add_task(label, total=None)
+
+    def step(self, done: float, total: float) -> None:
+        """Take how much is done."""
+        self._bar.update(self._task, completed=done, total=total)
+
+    def show(self, ended: threading.Event) -> None:
+        """Show the bar until the end."""
+        with self._bar:
+            ended.wait()
+
+
+class _ProgressLines:
+    """Progress as lines of a log."""
+
+    def __init__(self, label: str) -> None:
+        self._label, self._begin_s, self._share = label, time.monotonic(), 0.0
+
+    def step(self, done: float, total: float) -> None:
+        """Take how much is done."""
+        self._share = done / total if total else 0.0
+
+    def show(self, ended: threading.Event) -> None:
+        """Print lines until the end."""
+        while True:
+            percent = f", {100 * self._share:.0f} %" if self._share else ""
+            err.print(f"{self._label}: {time.monotonic() - self._begin_s:.0f} s{percent}", markup=False)
+            if ended.wait(LINE_PERIOD_S):
+                return
 
 
 def warn(text: str) -> None:

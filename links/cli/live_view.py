@@ -30,7 +30,7 @@ from stages.messages import DroneFix, PositionEstimate, RelativePose, TrackState
 
 SCREEN_PERIOD_S, LINE_PERIOD_S = 0.25, 5.0
 RATE_S = 1.0  # rates are averages over this time at least
-MAX_EDGES, MAX_OTHERS, MAX_EVENTS = 3, 2, 3  # rows of the screen
+MAX_EDGES, MAX_OTHERS, MAX_EVENTS = 3, 1, 3  # rows of the screen
 POSE_MESSAGES = ("ODOMETRY", "VISION_POSITION_ESTIMATE", "LANDING_TARGET")
 SHOWN = (RelativePose, DroneFix, TrackState)
 
@@ -150,10 +150,10 @@ class LiveView:
         report = status.report()
         self._rates.add(now_s, {name: link.records for name, link in report.links.items()})
         state, pose = self.latest.state_and_pose()
-        numbers = "; ".join(text for text in (_numbers(report), status.used) if text)
         lines = [f"{status.elapsed_s:8.1f} s   {state}", f"             {pose or 'no position'}"]
         lines += [f"             {sent}"] if (sent := _to_autopilot(report)) else []
-        parts: list[RenderableType] = [Text(line, no_wrap=True) for line in [*lines, f"             {numbers}"]]
+        lines += [f"             {text}" for text in (_numbers(report), status.used) if text]
+        parts: list[RenderableType] = [Text(line, no_wrap=True) for line in lines]
         parts += [self._sources(report, now_s), *_edges(report)]
         others = [
             Text(f"{name}: {_counts(counts)}", overflow="ellipsis", no_wrap=True)

@@ -179,7 +179,7 @@ def _run_live(
     for text in (*graph.left_out_texts(), *shipped_values(graph)):
         warn(text)
     if warm:
-        with progress_bar("loading compiled code (about two minutes when it must be compiled)", at_once=True) as step:
+        with progress_bar("loading compiled code (some minutes when it must be compiled)", at_once=True) as step:
             not_warm = warm_up(graph, step)
         if not_warm:
             warn(not_warm)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import binascii
 import functools
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,6 +20,7 @@ from typing import IO
 BLOCK_BYTES = 1 << 20
 _STAMP_BYTES = 8
 _V1, _V2 = 0xFE, 0xFD
+_MARKER = re.compile(b"[\xfd\xfe]")
 _V1_EXTRA_BYTES, _V2_EXTRA_BYTES, _SIGNATURE_BYTES = 8, 12, 13
 _SIGNED = 0x01  # v2 incompatibility flag
 _MAX_STAMP_US = 4_102_444_800_000_000  # the year 2100
@@ -57,7 +59,7 @@ def read_frames(stream: IO[bytes], path: Path, report: TlogReport) -> Iterator[t
         known = end is not None and _checksum_fits(data[offset + _STAMP_BYTES : end])
         if end is None or not (known or _follows(data, offset, end)):
             bad_from = start + offset if bad_from is None else bad_from
-            offset += 1
+            offset = _next_possible(data, offset + 1)
             report.done_bytes = start + offset
             continue
         if bad_from is not None:
@@ -100,6 +102,12 @@ def _frame_end(data: bytes, offset: int) -> int | None:
     else:
         return None
     return end if end <= len(data) else None
+
+
+def _next_possible(data: bytes, offset: int) -> int:
+    """The next position from `offset` on where a frame can be: its marker follows the time, or is not read yet."""
+    marker = _MARKER.search(data, offset + _STAMP_BYTES)
+    return marker.start() - _STAMP_BYTES if marker else max(offset, len(data) - _STAMP_BYTES)
 
 
 def _follows(data: bytes, offset: int, end: int) -> bool:

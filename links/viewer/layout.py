@@ -96,7 +96,8 @@ def layout(
 
 def _timing() -> rrb.Container:
     counts = _curves("Pulses and returns", "/plots/count/**", legend=True)
-    other = _curves("Lags of the edges, ages, speeds, counts", ["/plots/other/**", f"{EDGES}/**"], legend=True)
+    title = "Lags, ages, speeds, counts: point at a curve for its name"
+    other = _curves(title, ["/plots/other/**", f"{EDGES}/**"])
     numbers = rrb.Vertical(counts, other, row_shares=[1, 3])
     return rrb.Horizontal(numbers, rrb.Vertical(_log(), _status()), column_shares=[2, 1], name="Timing")
 
@@ -170,7 +171,8 @@ def _detection(depth_images: bool, candidates: bool) -> rrb.Container:
         rows.append((40, rrb.Horizontal(depth, score)))
     rows.append((36, rrb.TextDocumentView(name="Candidates: reasons", origin="/candidates")))
     if candidates:
-        rows.append((34, _curves("Probability of a drone [%]", "/plots/probability/**", legend=True)))
+        title = "Drone [%]: best violet, second grey, rejected red; accepted from green on"
+        rows.append((34, _curves(title, "/plots/probability/**")))
     rows.append((20, lidar_range))
     return rrb.Horizontal(_scene(candidates), _rows(rows), name="Detection")
 

@@ -31,6 +31,7 @@ from stages.cues.bias import CueBias
 from stages.geometry.frames import Array64
 from stages.geometry.trajectory import VehicleTrajectory
 from stages.messages import CueKind, CueState, DroneCue
+from stages.sums import sum_in_order
 
 NEWEST = 3  # measurements of a cue that count
 OLDEST_NS = 1_500_000_000
@@ -108,7 +109,7 @@ class CueEvidence:
                 by_source[source] = median_low([self._nats(z, cue.bias, trail, c) for z in recent])
         if not by_source:
             return 0.0, ""
-        total = min(sum(by_source.values()), self._weights.max_sum)
+        total = min(sum_in_order(by_source.values()), self._weights.max_sum)
         if min(by_source.values()) < CONTRADICTS_NATS:
             total = min(total, min(by_source.values()))
         return total, ", ".join(f"{source} {nats:+.1f}" for source, nats in by_source.items())

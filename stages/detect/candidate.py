@@ -20,6 +20,7 @@ from stages.detect.trained.existence import LEAST_FALSE_PER_S, observed_nats, su
 from stages.geometry.frames import Array64
 from stages.kernels.detect.candidate import ACCELERATION_MPS2, SIGMA_M, neighbour_score
 from stages.kernels.detect.isolation import SECTORS
+from stages.sums import sum_in_order
 
 HISTORY = 40  # observations kept
 SAME_PASS_NS = 30_000_000  # observations this close in time belong to one scan pass
@@ -172,7 +173,7 @@ class Candidate:
         self.neighbours = [(position_m, FADING * faded) for position_m, faded in self.neighbours[-HISTORY:]]
         if weight > 0.0:
             self.neighbours.append((s.xyz_map_m, weight))
-        self.neighbour_score = sum(
+        self.neighbour_score = sum_in_order(
             [faded for position_m, faded in self.neighbours if math.dist(position_m, s.xyz_map_m) < NEIGHBOUR_RADIUS_M]
         )
         self.isolated_score = FADING * self.isolated_score + (measured and weight == 0.0)

@@ -41,6 +41,7 @@ from stages.detect.candidate import (
 )
 from stages.kernels.detect.isolation import SECTORS
 from stages.kernels.detect.motion_log_ratios import SWAY_M
+from stages.sums import sum_in_order
 
 MOVED_NATS = 3.0  # telemetry log ratio above which the candidate has moved; without displacement it is the cap
 ALTERNATIVE_LOG_ODDS = 2.3  # below this the reason names the most probable alternative
@@ -150,7 +151,7 @@ def classify(c: Candidate, weights: ClassifierWeights, free_space: bool, motion_
     c.alternative = min(over, key=lambda alternative: over[alternative])
     c.rejection = ", ".join([c.alternative.value, *clutter.kinds])
     shift = over[c.alternative]
-    log_odds = shift - math.log(sum([math.exp(shift - value) for value in over.values()]))
+    log_odds = shift - math.log(sum_in_order([math.exp(shift - value) for value in over.values()]))
     if c.reacquired_at:
         log_odds -= e.reacquired / (c.scan_passes - c.reacquired_at)
     if c.log_ratios is None:

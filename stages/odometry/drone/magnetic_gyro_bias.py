@@ -29,6 +29,7 @@ import numpy as np
 from stages.geometry.frames import Array64
 from stages.kernels.geometry.so3 import exp_rotation
 from stages.messages import GyroBias
+from stages.sums import sum_in_order
 
 WINDOW_S, LONG = 2.0, 4  # one window; the number of them in a long one
 LEAST_SAMPLES = 5  # of the field, in a window
@@ -109,7 +110,7 @@ class MagneticGyroBias:
         self._short.add(slope)
         self._slopes.append(slope)
         if len(self._slopes) == LONG:
-            self._long.add(sum(self._slopes) / LONG)
+            self._long.add(sum_in_order(self._slopes) / LONG)
             self._slopes.clear()
         variance = max(self._short.variance, LONG * self._long.variance, _walk_variance(LEAST_WALK, seconds))
         return GyroBias(up_drone=up, bias_radps=slope, sigma_radps=math.sqrt(variance))

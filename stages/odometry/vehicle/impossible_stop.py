@@ -19,6 +19,7 @@ import math
 from collections import deque
 
 from stages.geometry.frames import Array64
+from stages.sums import sum_in_order
 
 BRAKING_MPS2 = 9.0
 TOLERANCE_M = 0.1
@@ -75,7 +76,7 @@ class ImpossibleStop:
             return
         (t0, x0), (t1, x1), (t2, x2) = self._poses[-3], self._poses[-2], self._poses[-1]
         share = (t1 - t0) / (t2 - t0)
-        off_m2 = sum((b - a - share * (c - a)) ** 2 for a, b, c in zip(x0, x1, x2, strict=True))
+        off_m2 = sum_in_order((b - a - share * (c - a)) ** 2 for a, b, c in zip(x0, x1, x2, strict=True))
         variance_m2 = off_m2 / (1.0 + share**2 + (1.0 - share) ** 2)
         largest_m2 = LARGEST * self._noise_m2 + FINEST_M**2
         self._noise_m2 += NOISE_SHARE * (min(variance_m2, largest_m2) - self._noise_m2)

@@ -206,6 +206,8 @@ def test_a_missing_file_is_an_error_with_a_similar_name(tmp_path):
     (tmp_path / "quickstart.yaml").write_text(GRAPH)
     with pytest.raises(ConfigError, match=r"quickstrat\.yaml: no such file\. Did you mean 'quickstart\.yaml'\?"):
         load_graph(tmp_path / "quickstrat.yaml")
+    with pytest.raises(ConfigError, match=r"nothing\.yaml: no such file\.$"):
+        load_graph(tmp_path / "nothing.yaml")
 
 
 @pytest.mark.parametrize(

@@ -120,7 +120,7 @@ def test_a_terminal_shows_state_sources_the_bad_edges_and_the_newest_events():
     text = shown(report_of(), pose(), terminal=True, news=["servo: stalled"], used="512 MB of memory, 41 GB free")
     for words in ("track.pulses", "sweep.swept_pulses", "150.0", "lost 7", "FULL: seen now", "12.3 s  servo: stalled"):
         assert words in text
-    assert "late; 512 MB of memory, 41 GB free" in text
+    assert "late\n             512 MB of memory, 41 GB free" in text
     assert "fuse: rejected: fix: not finite 3" in text
     for nothing in ("recorder", "back end reset"):
         assert nothing not in text

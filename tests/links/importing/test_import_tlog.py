@@ -1,5 +1,6 @@
 """Importing telemetry logs: frame boundaries, kept and counted data, real logs."""
 
+import io
 import struct
 from pathlib import Path
 from typing import IO, cast
@@ -13,6 +14,7 @@ from pymavlink.generator.mavcrc import x25crc
 
 from flow.link import LinkError, Record
 from links.importing import ImportReport, import_file
+from links.importing import tlog as tlog_module
 from links.importing.tlog import BLOCK_BYTES, TlogReport, read_frames, x25
 from links.recording import RecordingReader
 
@@ -213,3 +215,24 @@ def test_real_logs_give_the_frames_that_pymavlink_reads(tmp_path: Path, name: st
     assert bool(bad) == bool(report.warnings)
     if bad:
         assert f" {bad} frames have a checksum" in report.warnings[0]
+
+
+@pytest.mark.parametrize("gap", [b"", b"\x00" * 70_000, bytes(range(256)) * 300, b"\xfd\xfe" * 500])
+def test_between_frames_the_bytes_without_a_marker_are_skipped_at_once_and_all_counted(tmp_path: Path, gap: bytes):
+    content = tlog(frames()) + gap + tlog(frames()) + gap
+    report = TlogReport()
+    with io.BytesIO(content) as stream:
+        found = [frame for _, frame in read_frames(stream, tmp_path, report)]
+    assert found == frames() * 2
+    assert report.bad_bytes == 2 * len(gap)
+    assert report.done_bytes == len(content)
+
+
+def test_a_huge_file_of_zeros_is_not_tried_byte_by_byte(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    tried: list[int] = []
+    monkeypatch.setattr(tlog_module, "_frame_end", lambda data, offset: tried.append(offset))
+    report = TlogReport()
+    with io.BytesIO(bytes(30 * BLOCK_BYTES)) as stream:
+        assert list(read_frames(stream, tmp_path, report)) == []
+    assert report.bad_bytes == 30 * BLOCK_BYTES
+    assert len(tried) < 100

@@ -3,8 +3,9 @@
     b' = -b / T + w,   stationary covariance B        (first-order Gauss-Markov; before any comparison b ~ N(0, B))
     r  = b + v         residual of the cue to the LiDAR
 
-Residuals that neither bias nor noise explains, all of CONTRADICTS_NS and at least three, are a contradiction: the cue is
-of another drone, or its sensor has failed. It is trusted again after AGREES_NS in which all agree, and at least three.
+Residuals that neither bias nor noise explains, all of CONTRADICTS_NS and at least three, are a contradiction: the cue
+is of another drone, or its sensor has failed. It is trusted again after AGREES_NS in which all agree, and at least
+three do.
 
 Source: ours; Brown, Hwang, Introduction to Random Signals and Applied Kalman Filtering, ch. 3 (Gauss-Markov).
 """

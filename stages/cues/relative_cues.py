@@ -11,10 +11,11 @@ of GNSS is that of one receiver; those of drone and vehicle add up. The autopilo
 cannot contain a pose that grd sent (`IndependentTelemetry`); a receiver's own position never contains one.
 
 Source: ours. GNSS of a logged Pixhawk flight: 2.9 m off horizontally (median), nearly constant over 188 s: 2.5 m an
-axis (a Rayleigh distribution's median is 1.18 sigma). In another one (334 s, 5 Hz, tests/benchmarks/accuracy/bench_gnss_drift.py) position
-minus integrated Doppler velocity changes by 0.02, 0.07, 0.19, 0.29, 0.8 m an axis within 0.2, 1, 5, 10, 60 s: a random
-walk of 0.09 m/sqrt(s) and noise below 0.02 m. A bias of 2.5 m that walks twice as fast, as between buildings, has the
-correlation time 2 (2.5 / 0.18)^2 = 386 s; 0.1 m of noise are five times the measured.
+axis (a Rayleigh distribution's median is 1.18 sigma). In another flight of 334 s position minus integrated Doppler
+velocity changes by 0.02, 0.07, 0.19, 0.29, 0.8 m an axis within 0.2, 1, 5, 10, 60 s
+(tests/benchmarks/accuracy/bench_gnss_drift.py): a random walk of 0.09 m/sqrt(s) and noise below 0.02 m. A bias of 2.5 m
+that walks twice as fast, as between buildings, has the correlation time 2 (2.5 / 0.18)^2 = 386 s; 0.1 m of noise are
+five times the measured.
 """
 
 from __future__ import annotations

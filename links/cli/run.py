@@ -26,7 +26,7 @@ from links.runs.request import RunRequest, RunResult
 from links.runs.results import SUMMARY_FILE
 from links.runs.run_folder import replay_into
 from links.runs.shipped import CONFIGS, shipped, shipped_option
-from links.runs.warm_up import warm_up
+from links.runs.warm_up import warm_up, warm_up_graph
 from links.zenoh import host_graph
 
 DEFAULT_REPLAY_CONFIG = CONFIGS / "replay.yaml"
@@ -180,7 +180,7 @@ def _run_live(
         warn(text)
     if warm:
         with progress_bar("loading compiled code (some minutes when it must be compiled)", at_once=True) as step:
-            not_warm = warm_up(graph, step)
+            not_warm = warm_up(warm_up_graph(graph, request), step)
         if not_warm:
             warn(not_warm)
     with LiveView() as view_of_run:

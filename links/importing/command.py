@@ -59,22 +59,27 @@ def info(
 def export(
     source: Annotated[Path, typer.Argument(help="A recording, or the folder of a run.")],
     out_folder: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder to write [default: next to SOURCE, NAME_ros2].")
+        Path | None, typer.Option("--out", "-o", help="Folder or file to write [default: next to SOURCE, NAME_ros2].")
     ] = None,
     recording: Annotated[
         Path | None, typer.Option("--recording", help="Recording of the run, to add the sensors' data.")
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing bag.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing bag or file.")] = False,
+    foxglove: Annotated[
+        bool, typer.Option("--foxglove", help="Write one MCAP file in Foxglove's schemas [NAME_foxglove.mcap].")
+    ] = False,
 ) -> None:
-    """Write a recording or a run as a ROS 2 bag (MCAP) for RViz, Foxglove and ros2 bag play.
+    """Write a recording or a run as a ROS 2 bag (MCAP) for RViz and ros2 bag play, or as a file for Foxglove.
 
-    Example: grd export out/street_sweep-replay --recording recordings/street_sweep.mcap
+    Example: grd export out/street_sweep-replay --recording recordings/street_sweep.mcap --foxglove
     """
-    from links.ros.export import export as write
+    from links.foxglove import export as write_foxglove
+    from links.ros.export import export as write_ros
 
     if recording is not None and not source.is_dir():
         raise LinkError("--recording adds the sensors' data to a run's folder: without it give the recording itself")
-    target = out_folder or source.absolute().parent / f"{source.absolute().stem}_ros2"
+    write, ending = (write_foxglove, "_foxglove.mcap") if foxglove else (write_ros, "_ros2")
+    target = out_folder or source.absolute().parent / f"{source.absolute().stem}{ending}"
     with progress_bar(f"export {source.name}") as step:
         report = write(source, target, recording=recording, overwrite=overwrite, progress=step)
     for text in report.warnings:

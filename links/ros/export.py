@@ -8,6 +8,7 @@ Source: ours; rosbags (https://ternaris.gitlab.io/rosbags), rosbag2 format versi
 
 from __future__ import annotations
 
+import heapq
 import shutil
 import tempfile
 from collections import Counter
@@ -51,7 +52,7 @@ def export(
         hint = "" if not (out / BAG_METADATA).is_file() else ", or allow it to be overwritten (--overwrite)"
         raise LinkError(f"{out} exists already: choose another name{hint}")
     warnings: list[str] = []
-    messages = _messages(source, recording, warnings, progress)
+    messages = exported_messages(source, recording, warnings, progress)
     first = next(messages, None)
     if first is None:
         raise LinkError(f"{source}: no record that `grd export` converts: `grd info {source}` shows its topics")
@@ -69,17 +70,29 @@ def export(
     return ExportReport(out, topics, warnings)
 
 
-def _messages(source: Path, recording: Path | None, warnings: list[str], progress: Progress | None) -> Iterator[Entry]:
-    """The messages of a run, then those of its recording; or of a recording."""
+def exported_messages(
+    source: Path, recording: Path | None, warnings: list[str], progress: Progress | None
+) -> Iterator[Entry]:
+    """The messages of a run and those of its recording, or of a recording, by time."""
+    of_run: list[Entry] = []
     if source.is_dir():
         if recording is None:  # of a live run; later parts have longer names
             recording = min(source.glob("*.mcap"), key=lambda file: len(file.name), default=None)
-        yield from run_messages(source, whole=recording is None)
+        of_run = sorted(run_messages(source, whole=recording is None), key=_time_ns)
     else:
         recording = source
     if recording is None:
         warnings.append(f"{source}: without the sensors' data: name the recording with --recording to add them")
+        yield from of_run
         return
+    yield from heapq.merge(of_run, _recorded_messages(recording, warnings, progress), key=_time_ns)
+
+
+def _time_ns(entry: Entry) -> int:
+    return entry[2]
+
+
+def _recorded_messages(recording: Path, warnings: list[str], progress: Progress | None) -> Iterator[Entry]:
     session = Session(recording)
     messages = RecordingMessages(session.rig_yaml, str(recording))
     for record in session.records(progress=progress):

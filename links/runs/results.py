@@ -27,6 +27,7 @@ from stages.geometry.frames import quaternions_xyzw
 from stages.messages import (
     CandidateEvidence,
     CandidateLog,
+    CueFactor,
     CueState,
     DepthImage,
     Detections,
@@ -56,7 +57,17 @@ POSE_UPPER = tuple(f"c{a}{b}" for a in range(6) for b in range(a, 6))  # rotatio
 POSE_HEAD = "# T_vehicle_drone, fused; '0 0 0 1' where the rotation is unknown: the covariance table has rotation 0\n"
 UNKNOWN_RAD2 = math.pi**2  # variance of an unknown rotation in the table, which has no infinity
 UPPER_3, UPPER_6 = np.triu_indices(3), np.triu_indices(6)
-WRITTEN = (DroneFix, DepthImage, Detections, CandidateLog, TrackState, RelativeRotation, RelativePose, CueState)
+WRITTEN = (
+    DroneFix,
+    DepthImage,
+    Detections,
+    CandidateLog,
+    TrackState,
+    RelativeRotation,
+    RelativePose,
+    CueState,
+    CueFactor,
+)
 
 
 def drone_file(name: str, number: int) -> str:
@@ -120,6 +131,7 @@ class Results(Tap[ResultsSettings]):
         self._pose_states: Counter[str] = Counter()
         self._pose_reason: str = ""
         self._trusted: dict[str, bool] = {}  # cues, by source
+        self._fused: dict[str, bool] = {}  # cues in the fusion: whether used, by source
         self._resets: int = 0
         self._branch: tuple[str, int] | None = None  # state and switches of the newest rotation
 
@@ -208,6 +220,15 @@ class Results(Tap[ResultsSettings]):
         elif isinstance(message, CueState) and self._trusted.get(message.source) != message.trusted:
             self._trusted[message.source] = message.trusted
             self._log(message.stamp_ns, output, f"{message.source}: {message.reason}")
+        elif isinstance(message, CueFactor):
+            self._note_cue(output, message)
+
+    def _note_cue(self, output: str, message: CueFactor) -> None:
+        """Log when the fusion begins to use a cue, and when that contradicts."""
+        if not (message.used or message.contradicts) or self._fused.get(message.source) == message.used:
+            return
+        self._fused[message.source] = message.used
+        self._log(message.stamp_ns, output, f"{message.source}: {message.reason}")
 
     def _note_state(self, output: str, message: TrackState) -> None:
         """Store and log the state of a track when it changes."""

@@ -3,8 +3,9 @@
     b' = -b / T + w,   stationary covariance B        (first-order Gauss-Markov; before any comparison b ~ N(0, B))
     r  = b + v         residual of the cue to the LiDAR
 
-A residual that neither bias nor noise explains, three times in a row, is a contradiction: the cue is of another drone,
-or its sensor has failed. It is trusted again after ten residuals in a row that agree.
+Residuals that neither bias nor noise explains, all of CONTRADICTS_NS and at least three, are a contradiction: the cue
+is of another drone, or its sensor has failed. It is trusted again after AGREES_NS in which all agree, and at least
+three do.
 
 The bias learns only from residuals that agree. Agreements and contradictions are counted in measurements, not in time:
 a cue at 1 Hz is distrusted after 3 s and trusted again after 10 s, one at 10 Hz in a tenth of it.
@@ -21,10 +22,10 @@ import numpy as np
 
 from stages.geometry.frames import Array64
 
-TIME_S = 120.0  # correlation time: the logged GNSS bias was nearly constant over 188 s
 CHI2_999 = {1: 10.83, 2: 13.82, 3: 16.27}  # 99.9 % quantiles by degrees of freedom
-CONTRADICTIONS = 3
-AGREEMENTS = 10
+LEAST = 3  # a single reflection is neither
+CONTRADICTS_NS = 400_000_000
+AGREES_NS = 1_800_000_000
 
 
 class CueBias:
@@ -35,12 +36,12 @@ class CueBias:
         self.covariance_m2: Array64 = stationary_m2.copy()
         self.trusted = trusted
         self._stamp_ns: int | None = None
-        self._contradictions = self._agreements = 0
+        self._agrees, self._in_a_row, self._since_ns = True, 0, 0  # the newest residuals that agree, or that do not
 
-    def predict(self, stamp_ns: int, stationary_m2: Array64) -> None:
-        """Propagate to a time."""
+    def predict(self, stamp_ns: int, stationary_m2: Array64, time_s: float) -> None:
+        """Propagate to a time; `time_s`: correlation time T."""
         if self._stamp_ns is not None and stamp_ns > self._stamp_ns:
-            kept = math.exp(-(stamp_ns - self._stamp_ns) * 1e-9 / TIME_S)
+            kept = math.exp(-(stamp_ns - self._stamp_ns) * 1e-9 / time_s)
             self.mean_m = kept * self.mean_m
             self.covariance_m2 = kept**2 * self.covariance_m2 + (1.0 - kept**2) * stationary_m2
         self._stamp_ns = stamp_ns if self._stamp_ns is None else max(stamp_ns, self._stamp_ns)
@@ -50,16 +51,17 @@ class CueBias:
         innovation_m = residual_m - self.mean_m
         return float(innovation_m @ np.linalg.solve(self.covariance_m2 + noise_m2, innovation_m))
 
-    def compare(self, residual_m: Array64, noise_m2: Array64) -> None:
-        """Compare with the LiDAR: update the bias, or count a contradiction."""
-        if self.distance2(residual_m, noise_m2) > CHI2_999[len(residual_m)]:
-            self._agreements = 0
-            self._contradictions += 1
-            self.trusted = self.trusted and self._contradictions < CONTRADICTIONS
+    def compare(self, stamp_ns: int, residual_m: Array64, noise_m2: Array64) -> None:
+        """Compare with the LiDAR: update the bias, or note a contradiction."""
+        agrees = self.distance2(residual_m, noise_m2) <= CHI2_999[len(residual_m)]
+        if agrees is not self._agrees or self._in_a_row == 0:
+            self._agrees, self._in_a_row, self._since_ns = agrees, 0, stamp_ns
+        self._in_a_row += 1
+        enough_ns = AGREES_NS if agrees else CONTRADICTS_NS
+        if self._in_a_row >= LEAST and stamp_ns - self._since_ns >= enough_ns:
+            self.trusted = agrees
+        if not agrees:
             return
-        self._contradictions = 0
-        self._agreements += 1
-        self.trusted = self.trusted or self._agreements >= AGREEMENTS
         gain = self.covariance_m2 @ np.linalg.inv(self.covariance_m2 + noise_m2)
         self.mean_m = self.mean_m + gain @ (residual_m - self.mean_m)
         self.covariance_m2 = (np.eye(len(gain)) - gain) @ self.covariance_m2

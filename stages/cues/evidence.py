@@ -81,23 +81,23 @@ class CueEvidence:
         known = self._cues.get(cue.source)
         if known is None or len(known.bias.mean_m) != len(cue.value_m):  # the first, or of another kind
             trusted = known is None or known.bias.trusted
-            known = self._cues[cue.source] = _Cue(CueBias(cue.bias_covariance_m2, trusted))
+            known = self._cues[cue.source] = _Cue(CueBias(slow_covariance_m2(cue), trusted))
         known.newest.append(cue)
         bias = known.bias
-        bias.predict(cue.stamp_ns, cue.bias_covariance_m2)
+        bias.predict(cue.stamp_ns, slow_covariance_m2(cue), cue.bias_time_s)
         offset_m = math.nan
         if drones:
             compared = [residual_of(cue, trail, drone) for drone in drones]
             residual_m, noise_m2 = min(compared, key=lambda pair: bias.distance2(*pair))
             offset_m = float(np.linalg.norm(residual_m))
-            bias.compare(residual_m, noise_m2)
+            bias.compare(cue.stamp_ns, residual_m, noise_m2)
         return _state_of(cue, bias, offset_m, trail)
 
     def reset(self) -> None:
         """Frame map has changed: biases begin at their priors, measurements are removed, trust remains."""
         for cue in self._cues.values():
             if cue.newest:
-                cue.bias = CueBias(cue.newest[-1].bias_covariance_m2, cue.bias.trusted)
+                cue.bias = CueBias(slow_covariance_m2(cue.newest[-1]), cue.bias.trusted)
                 cue.newest.clear()
 
     def nats(self, c: ObjectState, trail: VehicleTrajectory, now_ns: int) -> tuple[float, str]:
@@ -131,6 +131,14 @@ def residual_of(cue: DroneCue, trail: VehicleTrajectory, c: ObjectState) -> tupl
     value_m, H = measure(cue.kind, offset_m, cue.reference_map_m)
     variance = max(c.p[0] + 2.0 * dt * c.p[1] + dt * dt * c.p[2], 0.0)
     return cue.value_m - value_m, cue.covariance_m2 + variance * (H @ H.T)
+
+
+def slow_covariance_m2(cue: DroneCue) -> Array64:
+    """(n, n) covariance of everything that changes slowly: the bias, and the yaw of a POSITION."""
+    if cue.yaw_sigma_rad == 0.0:
+        return cue.bias_covariance_m2
+    across_m = cue.yaw_sigma_rad * np.array([-cue.value_m[1], cue.value_m[0], 0.0])  # of one sigma of the yaw
+    return cue.bias_covariance_m2 + np.outer(across_m, across_m)
 
 
 def measure(kind: CueKind, offset_m: Array64, reference_m: Array64) -> tuple[Array64, Array64]:

@@ -15,6 +15,7 @@ import math
 import numpy as np
 
 from stages.fuse.consistency import InformationInflation, Rejected, inflation
+from stages.fuse.cues.cue_fusion import SEEN_NS, CueFusion
 from stages.fuse.fix_covariance import FixCovariance, fix_covariance
 from stages.fuse.graph import InertialGraph
 from stages.fuse.measurement_queue import Measurement, MeasurementQueue
@@ -31,7 +32,7 @@ from stages.heading.inertial_state import POSITION, InertialState
 from stages.heading.odometry_heading import OdometryHeading, OdomYaw
 from stages.heading.ownership import Ownership, log_evidence
 from stages.heading.rotation_matches import RotationMatches, combine
-from stages.messages import DroneFix, DroneMotion, RelativeRotation, VisualMotion
+from stages.messages import CueFactor, DroneCue, DroneFix, DroneMotion, RelativeRotation, VisualMotion
 
 TILT_TIME_S = 20.0  # time constant of the error of roll and pitch
 KEPT_NS = 15_000_000_000  # without a LiDAR position the estimate ends; the heading is remembered
@@ -48,6 +49,9 @@ class Estimator:
         self.imu = ImuBuffer()
         self.heading = InertialHeading(self.imu)
         self.graph = InertialGraph(self.imu, lag_s)
+        self.cues = CueFusion(errors, self.graph)
+        self.cue_factors: list[CueFactor] = []  # since they were last taken
+        self._by_imu: tuple[int, InertialState] | None = None  # the newest LiDAR position, propagated by the IMU alone
         self.ownership = Ownership()
         self.suspect = False  # what was followed moved otherwise than the IMU measures, and nothing has shown since
         self.odometry = OdometryHeading(math.radians(errors.compass_deg), errors.compass_outliers)
@@ -97,6 +101,8 @@ class Estimator:
                 self._use_fix(measurement)
             elif isinstance(measurement, RelativeRotation):
                 self._use_rotation(measurement)
+            elif isinstance(measurement, DroneCue):
+                self._use_cue(measurement)
             else:
                 self._use_visual_motion(measurement)
         self._advance(horizon_ns)
@@ -166,12 +172,15 @@ class Estimator:
         self.forget()
         self._queue.clear()
         self.imu.clear()
+        self.cues.restart()
 
     def _drop(self) -> None:
         self.resets += self.known
         self.graph.stop()
         self.heading.stop()
         self.fix_ns, self.nis = None, math.nan
+        self._by_imu = None
+        self.cues.restart()
         self._restart_filters()
 
     # measurements
@@ -218,6 +227,11 @@ class Estimator:
         noise = noise + (0.5 * LATE_MPS2 * late_s**2) ** 2 * np.eye(3)
         off = z - state.xyz_m[0]
         nis = mahalanobis2(off, state.covariance[0, POSITION, POSITION] + noise)
+        if nis > CHI2_999_3 and self._agrees_by_imu(stamp_ns, z, noise):
+            self._continue_by_imu()
+            state = self._at_horizon(stamp_ns)
+            off = z - state.xyz_m[0]
+            nis = mahalanobis2(off, state.covariance[0, POSITION, POSITION] + noise)
         if nis > CHI2_999_3 and self._rejected.add(stamp_ns, off, noise):
             self.forget()
             self._find(fix, z, covariance)
@@ -233,6 +247,7 @@ class Estimator:
         if used and self.known:
             self.nis, self.fix_ns = nis, max(stamp_ns, self.fix_ns or stamp_ns)
             self.bias_covariance_m2 = covariance.bias
+            self._by_imu = (self.graph.stamp_ns, self.graph.state) if self.graph.running else None
 
     def _at_horizon(self, stamp_ns: int) -> InertialState:
         """State at a measurement that is not before the horizon, else at the horizon."""
@@ -343,6 +358,52 @@ class Estimator:
             return False
         self._rejected_rotations.clear()
         return graph.add_rotation(one.R_map_drone, factor * one.spread_rad2)
+
+    def _use_cue(self, cue: DroneCue) -> None:
+        """Add a cue to the graph, while there is one."""
+        known = self._vehicle.known_at(cue.stamp_ns) or not self._vehicle.known
+        if not (self.graph.running and self.fix_ns and known and self._vehicle.in_current_frame(cue.stamp_ns)):
+            return
+        by_imu = None
+        if cue.stamp_ns - self.fix_ns >= SEEN_NS:
+            by_imu = self._propagated_by_imu()
+            if by_imu is None:
+                return
+        factor = self.cues.add(cue, self._vehicle, by_imu)
+        if factor is None:
+            return
+        self.cue_factors.append(factor)
+        if by_imu is not None and factor.contradicts:
+            self._continue_by_imu()
+
+    def _propagated_by_imu(self) -> InertialState | None:
+        """The newest LiDAR position, propagated to the graph's time by the IMU alone."""
+        if self._by_imu is None or not self.graph.running:
+            return None
+        stamp_ns, state = self._by_imu
+        if self.graph.stamp_ns > stamp_ns:
+            state = self.imu.propagate(state, np.ones(1), stamp_ns, self.graph.stamp_ns)
+            self._by_imu = self.graph.stamp_ns, state
+        return state
+
+    def _agrees_by_imu(self, stamp_ns: int, z: Array64, noise: Array64) -> bool:
+        """Whether a LiDAR position agrees with the IMU alone, after cues were used since the one before."""
+        if not self.graph.running or self.fix_ns is None or not self.cues.used_since(self.fix_ns + SEEN_NS):
+            return False
+        state = self._propagated_by_imu()
+        if state is None:
+            return False
+        ahead = self.imu.propagate(state, np.ones(1), self.graph.stamp_ns, max(stamp_ns, self.graph.stamp_ns))
+        return mahalanobis2(z - ahead.xyz_m[0], ahead.covariance[0, POSITION, POSITION] + noise) <= CHI2_999_3
+
+    def _continue_by_imu(self) -> None:
+        """Take the cues of this gap out of the estimate."""
+        assert self.fix_ns is not None
+        for source in self.cues.used_since(self.fix_ns + SEEN_NS):
+            self.cues.distrust(source)
+        state = self._propagated_by_imu()
+        if state is not None:
+            self.graph.start(self.graph.stamp_ns, state)
 
     def _use_visual_motion(self, motion: VisualMotion) -> None:
         if not self.graph.running:

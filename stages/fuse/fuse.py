@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -37,6 +37,8 @@ from stages.fuse.track_continuity import TrackContinuity
 from stages.geometry.frames import Array64, heading_rad
 from stages.heading.inertial_state import POSITION, VELOCITY, InertialState, yaw_sigma_rad
 from stages.messages import (
+    CueFactor,
+    DroneCue,
     DroneFix,
     DroneMotion,
     HeadingEstimate,
@@ -54,7 +56,7 @@ from stages.messages import (
 GRID_NS = 20_000_000
 HEADING_NS = 200_000_000  # between two HeadingEstimates
 LEAST_PUBLISHED = 1e-4  # probability of a hypothesis
-Poses = Iterator[RelativePose | HeadingEstimate]
+Poses = Iterator[RelativePose | HeadingEstimate | CueFactor]
 
 
 class FuseSettings(Settings):
@@ -63,6 +65,8 @@ class FuseSettings(Settings):
     parked: bool = False  # the vehicle is stationary, even without VehicleMotion
     track_id: int | None = Field(None, ge=1)  # follow this drone; None: the lowest number that is TRACKING
     lag_s: float = Field(2.0, ge=0.5, le=10)
+    # cues that enter the graph: those that are certainly of the drone whose IMU is used, as its autopilot's are
+    cue_sources: frozenset[Literal["gnss", "uwb", "altitude"]] = frozenset({"gnss", "altitude"})
     errors: FuseErrors = FuseErrors()
     limits: FuseLimits = FuseLimits()
 
@@ -71,7 +75,7 @@ class Fuse(Stage[FuseSettings]):
     """Pose of the drone by IMU and LiDAR, with its state."""
 
     optional_inputs: ClassVar[frozenset[str]] = frozenset(
-        {"rotation", "motion", "drone_motion", "visual_motion", "prior", "track", "servo", "tick"}
+        {"rotation", "motion", "drone_motion", "visual_motion", "prior", "track", "cue", "servo", "tick"}
     )
 
     def __init__(self, settings: FuseSettings | None = None, /, **values: Any) -> None:
@@ -90,7 +94,9 @@ class Fuse(Stage[FuseSettings]):
         """Invalid messages by reason, and resets of the smoother."""
         late = {"too late": self._estimator.too_late} if self._estimator.too_late else {}
         recoveries = self._estimator.graph.recoveries
-        return Counters({"back end reset": recoveries} if recoveries else {}, {**self._intake.rejected, **late})
+        wrong = {f"cue {source}: distrusted": n for source, n in self._estimator.cues.distrusted.items()}
+        reset = {"back end reset": recoveries} if recoveries else {}
+        return Counters(reset, {**self._intake.rejected, **late, **wrong})
 
     def on_motion(self, motion: VehicleMotion) -> Poses:
         """Pose of the vehicle in `map`."""
@@ -148,6 +154,13 @@ class Fuse(Stage[FuseSettings]):
             self._estimator.add(rotation)
         yield from self._publish(rotation)
 
+    def on_cue(self, cue: DroneCue) -> Poses:
+        """Measurement of GNSS, ranging or altitude."""
+        used = cue.source in self.settings.cue_sources
+        if used and self._intake.is_valid_cue(cue) and self._map_frame.is_fixed(cue.stamp_ns):
+            self._estimator.add(cue)
+        yield from self._publish(cue)
+
     def on_servo(self, servo: ServoState) -> Poses:
         """Clock of a replay without other messages."""
         yield from self._publish(servo)
@@ -171,6 +184,8 @@ class Fuse(Stage[FuseSettings]):
             self._estimator.start_map()
         self._map_was_fixed = fixed
         self._estimator.pass_time(now_ns)
+        yield from self._estimator.cue_factors
+        self._estimator.cue_factors.clear()
         heading = at_ns // HEADING_NS > self._published_ns // HEADING_NS
         self._published_ns = at_ns
         yield self._pose(at_ns)

@@ -7,6 +7,7 @@
     B_k               a prior of the gyroscope's bias, by the turn between two images, about the vertical by the
                       magnetometer
     first key         the joint covariance (15, 15) of the bank: JacobianFactor in a LinearContainerFactor
+    X_k, C_m          cues, each with a state of its own (cues/cue_factors.py); only where there are cues
 
 Each input is checked first; an error of GTSAM starts a new smoother at the last valid state with its joint covariance.
 An interval without IMU does the same, after a propagation at constant velocity.
@@ -16,8 +17,9 @@ Source: Kaess et al., iSAM2 (IJRR 2012); Forster et al. (T-RO 2017); GTSAM 4.3 n
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import gtsam
 import numpy as np
@@ -26,17 +28,41 @@ from gtsam.symbol_shorthand import B, V, X
 from stages.geometry.frames import Array64
 from stages.geometry.se3 import is_covariance
 from stages.heading.imu_buffer import ImuBuffer
-from stages.heading.inertial_state import ACCEL_WALK, GRAVITY_MPS2, GYRO_WALK, POSITION, ImuIntervals, InertialState
+from stages.heading.inertial_state import (
+    ACCEL_WALK,
+    GRAVITY_MPS2,
+    GYRO_WALK,
+    POSITION,
+    ImuIntervals,
+    InertialState,
+)
 from stages.kernels.geometry.so3 import exp_rotation
 from stages.messages import GyroBias
 
 RAISED = (RuntimeError, IndexError, ValueError)  # C++ exceptions through GTSAM's wrapper
 HUBER = 1.345  # [sigma]: 95 % efficient on Gaussian noise
 KEY_NS = 200_000_000  # longest time between two keys
+LAG_MARGIN_S = 0.3  # keys this close to the end of the lag get no factors
 NEWEST_NS = 2_000_000  # a measurement this close to the newest key is of its time
 FARTHEST_M = 1e5
 UP = gtsam.Unit3(np.array([0.0, 0.0, 1.0]))
 ANY_BIAS = 1e3  # [m/s^2], [rad/s] no information
+
+
+class NearestKey(NamedTuple):
+    """The key nearest to a time, and the drone at that time."""
+
+    key: int
+    key_xyz_m: Array64  # position (3,) of the key, map
+    xyz_m: Array64  # position (3,) at the time
+    velocity_mps: Array64
+
+
+class _KeyState(NamedTuple):
+    number: int
+    stamp_ns: int
+    xyz_m: Array64
+    velocity_mps: Array64
 
 
 class InertialGraph:
@@ -47,7 +73,9 @@ class InertialGraph:
         self._number, self._first_ns = 0, 0
         self._smoother: Any = None
         self._pending: list[Callable[[int], Any]] = []  # factors of the newest key, by its number
-        self.recoveries = 0
+        self._recent: deque[_KeyState] = deque()  # keys within the lag, with their first estimates
+        self.held: set[int] = set()  # other keys that stay in the lag
+        self.recoveries, self.starts = 0, 0
         self.running = False
         self.stamp_ns = 0
         self.state = _empty()
@@ -67,7 +95,10 @@ class InertialGraph:
         params.findUnusedFactorSlots = True  # else its list of factors grows without bound
         self._smoother = gtsam.IncrementalFixedLagSmoother(self._lag_s, params)
         self._number, self._first_ns = self._number + 1, stamp_ns
+        self.starts += 1
         self._pending.clear()
+        self._recent.clear()
+        self.held.clear()
         self.stamp_ns, self.state, self.running = stamp_ns, state, True
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         self._insert(values, state)
@@ -79,6 +110,7 @@ class InertialGraph:
         )
         graph.add(gtsam.LinearContainerFactor(prior, values))
         self._smoother.update(graph, values, self._times())
+        self._remember()
 
     def stop(self) -> None:
         """Drop the smoother."""
@@ -129,6 +161,38 @@ class InertialGraph:
         up = measured.up_drone
         covariance = ANY_BIAS**2 * np.eye(3) + (measured.sigma_radps**2 - ANY_BIAS**2) * np.outer(up, up)
         self.add_gyro_bias(measured.bias_radps * up, covariance)
+
+    def nearest_key(self, stamp_ns: int) -> NearestKey | None:
+        """The key nearest to a time, and the drone at that time; None: before the oldest key that can be used."""
+        recent = self._recent
+        if not (self.running and recent and stamp_ns >= recent[0].stamp_ns):
+            return None
+        newest = recent[-1]
+        if stamp_ns >= newest.stamp_ns:
+            ahead = self.at(stamp_ns)
+            return NearestKey(X(newest.number), self.state.xyz_m[0], ahead.xyz_m[0], ahead.velocity_mps[0])
+        i = next(k for k in range(len(recent) - 1, -1, -1) if recent[k].stamp_ns <= stamp_ns)
+        a, b = recent[i], recent[i + 1]
+        share = (stamp_ns - a.stamp_ns) / (b.stamp_ns - a.stamp_ns)
+        key = a if share < 0.5 else b
+        dt_s, sign = abs(stamp_ns - key.stamp_ns) * 1e-9, 1.0 if key is a else -1.0
+        velocity_mps = (1.0 - share) * a.velocity_mps + share * b.velocity_mps
+        xyz_m = key.xyz_m + sign * 0.5 * dt_s * (velocity_mps + key.velocity_mps)
+        return NearestKey(X(key.number), key.xyz_m, xyz_m, velocity_mps)
+
+    def vector(self, key: int) -> Array64:
+        """Estimate of another variable by its key."""
+        return self._smoother.calculateEstimateVector(key)
+
+    def vector_with_position(self, key: int) -> tuple[Array64, Array64, Array64]:
+        """Estimate (m,) of another variable, its covariance (m, m), and that (3, m) with the newest position, map."""
+        joint = self._smoother.getISAM2().jointMarginalCovariance([X(self._number), key])
+        cross = self.state.R[0] @ joint.at(X(self._number), key)[3:]
+        return self.vector(key), joint.at(key, key), cross
+
+    def add_factors(self, factors: Any, values: Any) -> bool:
+        """Add factors of keys from `nearest_key`, and of others that are `held`, with new values of those."""
+        return self.running and self._guarded(factors, values, self._times(), self.state)
 
     def at(self, stamp_ns: int) -> InertialState:
         """The state (one row) propagated to a time."""
@@ -189,7 +253,16 @@ class InertialGraph:
 
     def _times(self) -> dict[int, float]:
         at_s, n = (self.stamp_ns - self._first_ns) * 1e-9, self._number
-        return {X(n): at_s, V(n): at_s, B(n): at_s}
+        return {X(n): at_s, V(n): at_s, B(n): at_s, **dict.fromkeys(self.held, at_s)}
+
+    def _remember(self) -> None:
+        """Keep the newest key's position and velocity, and those of the keys that are safely within the lag."""
+        state, recent = self.state, self._recent
+        if recent and recent[-1].number == self._number:
+            recent.pop()
+        recent.append(_KeyState(self._number, self.stamp_ns, state.xyz_m[0], state.velocity_mps[0]))
+        while recent[0].stamp_ns < self.stamp_ns - round(1e9 * (self._lag_s - LAG_MARGIN_S)):
+            recent.popleft()
 
     def _guarded(self, graph: Any, values: Any, times: dict[int, float], fallback: InertialState) -> bool:
         """Update and read the newest key; on failure restart at the fallback."""
@@ -204,6 +277,7 @@ class InertialGraph:
             self.start(self.stamp_ns, fallback)
             return False
         self.state = newest
+        self._remember()
         return True
 
     def _newest(self) -> InertialState | None:

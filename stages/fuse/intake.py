@@ -14,9 +14,10 @@ import numpy as np
 from flow.message import Message
 from stages.geometry.frames import Array64
 from stages.geometry.se3 import is_covariance
-from stages.messages import DroneFix, RelativeRotation, VisualMotion
+from stages.messages import CueKind, DroneCue, DroneFix, RelativeRotation, VisualMotion
 
 AHEAD_NS = 1_000_000_000
+CUE_SIZE = {CueKind.POSITION: 3, CueKind.LEVEL_AND_HEIGHT: 2, CueKind.RANGE: 1, CueKind.HEIGHT: 1}
 MAX_REJECTED_STAMPS = 5
 
 
@@ -74,6 +75,17 @@ class Intake:
         direction = () if motion.direction_from is None else (motion.direction_from,)
         sigma_rad = np.array(motion.direction_sigma_rad or 0.0)
         return self.is_valid(motion, "visual motion", motion.R_from_to, motion.covariance_rad2, sigma_rad, *direction)
+
+    def is_valid_cue(self, cue: DroneCue) -> bool:
+        """Whether a cue can be used."""
+        n, times = CUE_SIZE[cue.kind], np.array([cue.bias_time_s, cue.yaw_sigma_rad])
+        covariances = cue.covariance_m2, cue.bias_covariance_m2
+        if not self.is_valid(cue, "cue", cue.value_m, cue.reference_map_m, times, *covariances):
+            return False
+        if len(cue.value_m) != n or cue.bias_time_s <= 0.0 or any(C.shape != (n, n) for C in covariances):
+            self.rejected["cue: not of its kind"] += 1
+            return False
+        return all(self.is_covariance(C, "cue") for C in covariances)
 
     def pass_time(self, stamp_ns: int) -> int | None:
         """The time after a stamp was received; None: the stamp is rejected."""

@@ -12,12 +12,12 @@ import heapq
 
 from stages.geometry.trajectory import VehicleTrajectory
 from stages.heading.imu_buffer import ImuBuffer
-from stages.messages import DroneFix, RelativeRotation, VisualMotion
+from stages.messages import DroneCue, DroneFix, RelativeRotation, VisualMotion
 
 DELAY_NS = 100_000_000  # measurements arrive at most this long after their stamp
 VEHICLE_NS, WAIT_NS = 60_000_000, 350_000_000  # extrapolation of the vehicle's pose; longest wait for a newer one
 IMAGE_NS = 300_000_000  # without an IMU, longest wait for the drone's next image
-Measurement = DroneFix | RelativeRotation | VisualMotion
+Measurement = DroneFix | RelativeRotation | VisualMotion | DroneCue
 
 
 class MeasurementQueue:

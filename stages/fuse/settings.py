@@ -29,6 +29,9 @@ class FuseErrors(StrictModel):
     rotation_bias_share: float = Field(default=0.2, ge=0, lt=1)
     compass_deg: float = Field(default=7.0, gt=0)  # of the autopilot's yaw
     compass_outliers: float = Field(default=0.03, gt=0, lt=1)  # share of autopilots whose yaw is wrong by any angle
+    cue_time_s: float = Field(default=1.0, ge=0)  # time constant of the noise of cues
+    cue_clock_s: float = Field(default=0.05, ge=0)  # of the latency of cues
+    cue_seen_m: float = Field(default=0.1, ge=0)  # of the drone's position by LiDAR and IMU at a cue, each axis
     changed_frames: float = Field(default=0.05, gt=0, lt=1)  # share of restarts while the autopilot changes its frame
 
 

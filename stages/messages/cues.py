@@ -69,7 +69,7 @@ class CueKind(enum.Enum):
     HEIGHT = 3  # z
 
 
-@message(schema=114)
+@message(schema=116)
 class DroneCue(Message):
     """One measurement of the drone's position relative to the vehicle's origin, in the axes of frame map."""
 
@@ -78,6 +78,8 @@ class DroneCue(Message):
     value_m: PerPointF64  # (n,) as `kind` says
     covariance_m2: Annotated[NDArray[np.float64], Shape("n", "n")]  # of the noise, which averages out
     bias_covariance_m2: Annotated[NDArray[np.float64], Shape("n", "n")]  # of the part that changes slowly
+    bias_time_s: float  # correlation time of that part
+    yaw_sigma_rad: float  # of the rotation of a POSITION about the vertical; it changes slowly, too
     reference_map_m: Vec3  # offset from the vehicle's origin to the point from which a RANGE is measured; else zero
 
 
@@ -96,3 +98,19 @@ class CueState(Message):
     offset_m: float  # distance between measurement and LiDAR, without correction of the bias; NaN: no drone found
     xyz_vehicle_m: Vec3 | None  # position of the drone by this cue, bias corrected; None: no position, or not trusted
     covariance_m2: Mat3 | None
+
+
+@message(schema=117)
+class CueFactor(Message):
+    """What the fusion did with one measurement of a cue.
+
+    stamp_ns: that of the measurement.
+    """
+
+    source: str
+    used: bool  # it entered the graph
+    contradicts: bool  # the estimate, the IMU or the drone's motion: the cue must show again that it is of the drone
+    reason: str
+    bias_m: PerPointF64  # (n,) estimate of the slowly changing error, in the graph
+    bias_sigma_m: float  # largest
+    offset_m: float  # distance between measurement and estimate, without correction of the bias

@@ -6,7 +6,9 @@
 
 The biases of two receivers are independent. Real receivers close together share a part of theirs (ionosphere, orbits):
 `bias_m` is the rest, so that the difference of two positions is as far off as one receiver of a logged Pixhawk flight
-was (2.9 m horizontally, nearly constant over 188 s).
+was: 2.9 m horizontally (median of a Rayleigh distribution with 2.46 m an axis), nearly constant over 188 s. Walk and
+noise of another log: 0.09 m/sqrt(s) an axis, which at 1.75 m is a correlation time of 2 (1.75 / 0.09)^2 = 756 s, and
+0.02 m (tests/benchmarks/accuracy/bench_gnss_drift.py).
 
 Source: ours; non-line-of-sight
 ranging: Marano et al., IEEE JSAC 28 (2010), positive errors of up to several metres.
@@ -32,11 +34,11 @@ class ReceiverSettings(StrictModel):
 
     rate_hz: float = Field(default=5.0, ge=0.2, le=50)
     latency_s: float = Field(default=0.2, ge=0, le=2)
-    bias_m: float = Field(default=1.3, ge=0, le=100)  # of two receivers horizontally 2.6 m
-    bias_up_m: float = Field(default=2.0, ge=0, le=100)
-    bias_time_s: float = Field(default=200.0, gt=1)
-    noise_m: float = Field(default=0.3, ge=0, le=100)
-    noise_up_m: float = Field(default=0.5, ge=0, le=100)
+    bias_m: float = Field(default=1.75, ge=0, le=100)
+    bias_up_m: float = Field(default=2.6, ge=0, le=100)
+    bias_time_s: float = Field(default=756.0, gt=1)
+    noise_m: float = Field(default=0.02, ge=0, le=100)
+    noise_up_m: float = Field(default=0.03, ge=0, le=100)
     offset_world_m: Vector3 = (0.0, 0.0, 0.0)  # a wrong cue
     of_drone: int = Field(default=1, ge=1, le=10)  # another one's: a wrong cue
     heading_sigma_deg: float | None = Field(default=None, ge=0, le=45)  # constant error of a heading; None: no heading

@@ -126,7 +126,10 @@ class RealTimeRig:
 
     def __init__(self, rig: LiveRigSettings, folder: Path) -> None:
         scenario = load_scenario(rig.scenario)
-        overrides = {"seed": rig.seed, "duration_s": rig.duration_s}
+        overrides: dict[str, Any] = {"seed": rig.seed, "duration_s": rig.duration_s}
+        if rig.lidar_model is not None and rig.lidar_model != scenario.rig.model:
+            lidar = {"model": rig.lidar_model, "mount": scenario.rig.mount}
+            overrides["rig"] = lidar if rig.lidar_beams is None else {**lidar, "beams": rig.lidar_beams}
         scenario = scenario.changed(**{name: value for name, value in overrides.items() if value is not None})
         self._rig, self._folder = rig, folder
         if rig.images is None:  # nothing reads its cameras

@@ -1,6 +1,6 @@
 """The simulated rig in real time, for a live run, as a link: it starts the process of the rig, and ends it.
 
-The process (`links.simulated.rig.live_process`) sends what the hardware would: VLP-16 packets and the vehicle's
+The process (`links.simulated.rig.live_process`) sends what the hardware would: the LiDAR's packets and the vehicle's
 odometry by UDP, the servo on a pty, the autopilot's MAVLink by UDP, all on this host. From the graph it receives only
 the goals of the servo and the poses for the autopilot. It writes the ground truth to `truth.mcap` and its timing to
 `rig.json`, in the folder of the run. It cannot render camera images in real time: it serves those of a recording of the
@@ -25,6 +25,8 @@ from flow.link import LinkError, Run, Tap
 from flow.message import Message
 from flow.stage import Settings
 from links.runs.shipped import shipped
+from stages.geometry.lidar_models import LidarModel
+from stages.geometry.rig_lidar import LidarBeams
 
 START_S = 120.0  # limit for building the world and, once, compiling
 END_S = 1.0
@@ -42,8 +44,12 @@ class LiveRigSettings(Settings):
     duration_s: float | None = Field(None, gt=0, le=7200)  # None: that of the scenario; after it, motions stand still
     servo: Path  # link to the servo's pty that is created: `$links.servo.config.port`
     lidar_port: int = Field(2368, ge=1, le=65535)
-    position_port: int | None = Field(None, ge=1, le=65535)  # of the LiDAR's position packets; None: none are sent
+    position_port: int | None = Field(
+        None, ge=1, le=65535
+    )  # of the LiDAR's position packets; None: none are sent. Only a Velodyne has them
     autopilot_port: int | None = Field(None, ge=1, le=65535)  # where grd receives MAVLink; None: no radio
+    lidar_model: LidarModel | None = None  # None: that of the scenario; the mount is the scenario's
+    lidar_beams: LidarBeams | None = None  # of one Ouster or Hesai, as in the rig file
     armed: bool = True  # False: its autopilot reports disarmed, as before a flight (`grd preflight` requires that)
     odometry_port: int | None = Field(None, ge=1, le=65535)  # where grd receives odometry; None: none is sent
     images: Path | None = None  # a recording of the scenario, made by `grd simulate`; None: no cameras

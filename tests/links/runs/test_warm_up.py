@@ -6,8 +6,11 @@ import pytest
 
 from flow.graph import load_graph
 from flow.link import Record
+from links.lidar import Lidar
 from links.recording import RecordingWriter
-from links.runs.warm_up import RECORDING, warm_up
+from links.runs.request import RunRequest
+from links.runs.shipped import CONFIGS
+from links.runs.warm_up import RECORDING, warm_up, warm_up_graph
 
 GRAPH = """\
 stages:
@@ -42,6 +45,26 @@ def test_a_stage_that_raises_and_a_missing_recording_are_only_reported(graph, tm
     assert status.startswith("warm-up on warm.mcap failed, the first messages may be late: brittle.number")
     status = warm_up(graph, lambda done, total: None, tmp_path / "none.mcap")
     assert "none.mcap: no such file" in status
+
+
+@pytest.mark.parametrize(
+    ("config", "sets"), [("sim_live_xt16.yaml", ()), ("sim_live.yaml", ("rig.lidar.model=HDL-32E",))]
+)
+def test_another_lidar_is_warmed_up_with_the_rig_of_the_recording(config, sets):
+    request = RunRequest(CONFIGS / config, sets=sets)
+    graph = request.graph(None, "")
+    assert model_of(graph) != "VLP-16"
+    assert model_of(warm_up_graph(graph, request)) == "VLP-16"
+
+
+def test_the_lidar_of_the_recording_is_warmed_up_as_configured():
+    request = RunRequest(CONFIGS / "sim_live.yaml", sets=("rig.drone.span_m=0.7",))
+    graph = request.graph(None, "")
+    assert warm_up_graph(graph, request) is graph
+
+
+def model_of(graph):
+    return next(spec.cls(**spec.config).settings.unit.model for spec in graph.nodes.values() if spec.cls is Lidar)
 
 
 def test_its_recording_is_part_of_grd():

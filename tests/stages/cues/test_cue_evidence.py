@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from stages.cues.bias import AGREEMENTS, CONTRADICTIONS, CueBias
-from stages.cues.evidence import CueEvidence, CueWeights, ObjectState, measure
+from stages.cues.bias import AGREES_NS, CONTRADICTS_NS, LEAST, CueBias
+from stages.cues.evidence import CueEvidence, CueWeights, ObjectState, measure, slow_covariance_m2
 from stages.geometry.frames import rotation_z
 from stages.geometry.trajectory import VehicleTrajectory
 from stages.messages import CueKind, DroneCue, VehicleMotion
 from tests.stages.made import START_NS
+
+S = 1_000_000_000
 
 TRAIL = VehicleTrajectory()
 PLACE_M = np.array([12.0, -5.0, 9.0])
@@ -44,6 +47,8 @@ def cue(source: str, kind: CueKind, value_m, noise_m: float, bias_m: float, t_s:
         value_m=np.asarray(value_m, dtype=np.float64),
         covariance_m2=noise_m**2 * np.eye(n),
         bias_covariance_m2=bias_m**2 * np.eye(n),
+        bias_time_s=120.0,
+        yaw_sigma_rad=0.0,
         reference_map_m=np.zeros(3),
     )
 
@@ -127,7 +132,7 @@ def test_the_bias_is_estimated_and_corrects_the_position():
 def test_a_cue_30_m_off_is_reported_and_not_used():
     evidence = CueEvidence(CueWeights(), SEARCH_M)
     wrong_m = PLACE_M + np.array([21.0, -21.0, 0.0])
-    for k in range(CONTRADICTIONS):
+    for k in range(LEAST):
         state = evidence.add(gnss(wrong_m, 0.2 * k), TRAIL, [thing(t_s=0.2 * k)])
     assert not state.trusted
     assert "contradicts the LiDAR, 29.7 m" in state.reason
@@ -138,31 +143,44 @@ def test_a_cue_30_m_off_is_reported_and_not_used():
 def test_a_cue_is_trusted_again_after_it_agreed_for_some_time():
     bias = CueBias(np.array([[1.0]]))
     noise_m2 = np.array([[0.01]])
-    for _ in range(CONTRADICTIONS):
-        bias.compare(np.array([20.0]), noise_m2)
+    for k in range(LEAST):
+        bias.compare(START_NS + k * CONTRADICTS_NS // (LEAST - 1), np.array([20.0]), noise_m2)
     assert not bias.trusted
     assert bias.mean_m == 0.0  # a contradiction is no bias
-    for _ in range(AGREEMENTS - 1):
-        bias.compare(np.array([0.5]), noise_m2)
-    assert not bias.trusted
-    bias.compare(np.array([0.5]), noise_m2)
+    for k in range(10):
+        assert not bias.trusted
+        bias.compare(START_NS + S + k * AGREES_NS // 9, np.array([0.5]), noise_m2)
     assert bias.trusted
+
+
+@pytest.mark.parametrize(("rate_hz", "distrusted_s"), [(1.0, 2.0), (5.0, 0.4), (10.0, 0.4), (50.0, 0.4)])
+def test_trust_is_lost_after_a_time_whatever_the_rate(rate_hz, distrusted_s):
+    bias, times = CueBias(np.array([[1.0]])), np.arange(0.0, 4.0, 1 / rate_hz)
+    for t in times:
+        bias.compare(START_NS + round(1e9 * t), np.array([20.0]), np.array([[0.01]]))
+        assert bias.trusted == (t < distrusted_s - 1e-9), t
 
 
 def test_without_the_lidar_a_bias_is_forgotten_slowly():
     stationary_m2 = np.array([[4.0]])
     bias = CueBias(stationary_m2)
-    bias.predict(START_NS, stationary_m2)
-    bias.compare(np.array([3.0]), np.array([[0.01]]))
+    bias.predict(START_NS, stationary_m2, 120.0)
+    bias.compare(START_NS, np.array([3.0]), np.array([[0.01]]))
     before = float(bias.mean_m[0])
-    bias.predict(START_NS + 120_000_000_000, stationary_m2)
+    bias.predict(START_NS + 120_000_000_000, stationary_m2, 120.0)
     assert float(bias.mean_m[0]) == pytest.approx(before / math.e)
     assert float(bias.covariance_m2[0, 0]) == pytest.approx(4.0 * (1 - math.exp(-2.0)), rel=0.02)
 
 
+def test_an_error_of_north_acts_across_the_direction_to_the_drone():
+    turned = replace(gnss(np.array([10.0, 0.0, 5.0])), yaw_sigma_rad=0.1)
+    assert slow_covariance_m2(turned) == pytest.approx(np.diag([3.5**2, 3.5**2 + 1.0, 3.5**2]))
+    assert slow_covariance_m2(gnss()) == pytest.approx(3.5**2 * np.eye(3))
+
+
 def test_a_cue_of_another_kind_starts_a_new_bias_but_stays_distrusted():
     evidence = CueEvidence(CueWeights(), SEARCH_M)
-    for k in range(CONTRADICTIONS):
+    for k in range(LEAST):
         evidence.add(gnss(PLACE_M + np.array([30.0, 0, 0]), 0.2 * k), TRAIL, [thing(t_s=0.2 * k)])
     level = cue("gnss", CueKind.LEVEL_AND_HEIGHT, [13.0, 9.0], 0.3, 3.5, 1.0)
     assert not evidence.add(level, TRAIL, []).trusted

@@ -25,6 +25,8 @@ def gnss(t_s: float, xyz_m) -> DroneCue:
         value_m=np.asarray(xyz_m, dtype=np.float64),
         covariance_m2=0.2 * np.eye(3),
         bias_covariance_m2=12.0 * np.eye(3),
+        bias_time_s=120.0,
+        yaw_sigma_rad=0.0,
         reference_map_m=np.zeros(3),
     )
 

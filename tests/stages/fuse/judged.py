@@ -10,7 +10,7 @@ import numpy as np
 
 from stages.fuse import Fuse
 from stages.kernels.geometry.so3 import log_rotation
-from stages.messages import HeadingEstimate, PoseEstimate, RelativePose
+from stages.messages import CueFactor, HeadingEstimate, PoseEstimate, RelativePose
 from tests.stages.fuse.fuse_inputs import Fault
 from tests.stages.fuse.imu_flights import ImuFlight, seconds
 
@@ -40,6 +40,7 @@ class Flown:
     cpu_ms: float = 0.0  # per second of flight
     poses: list[RelativePose] = field(default_factory=list)
     headings: list[HeadingEstimate] = field(default_factory=list)
+    cues: list[CueFactor] = field(default_factory=list)
 
 
 def fly(flight: ImuFlight, stage: Fuse | None = None, fault: Fault = list, frame: str = MAP) -> Flown:
@@ -49,7 +50,8 @@ def fly(flight: ImuFlight, stage: Fuse | None = None, fault: Fault = list, frame
     began = time.thread_time()
     for _, port, message in events:
         for made in getattr(stage, f"on_{port}")(message):
-            (out.headings if isinstance(made, HeadingEstimate) else out.poses).append(made)
+            into = out.headings if isinstance(made, HeadingEstimate) else out.poses
+            (out.cues if isinstance(made, CueFactor) else into).append(made)
     out.cpu_ms = 1e3 * (time.thread_time() - began) / flight.until_s
     for heading in out.headings:
         _add_heading(out, flight, heading, frame)

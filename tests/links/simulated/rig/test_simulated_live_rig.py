@@ -109,6 +109,66 @@ def test_the_rig_sends_current_packets_and_its_rays_follow_the_servo(tmp_path, p
     assert json.loads(poses[0].data)["xyz_m"] == [5.0, 2.0, 9.0]
 
 
+OS1_32 = yaml.safe_load((ROOT / "configs" / "rigs" / "os1_32_example.yaml").read_text())["rig"]["lidar"]
+
+
+@pytest.mark.parametrize("unit", [{"model": "XT16"}, OS1_32], ids=lambda unit: unit["model"])
+def test_the_rig_sends_the_packets_of_another_lidar(unit, tmp_path, ports):
+    pytest.importorskip("embreex", reason="simulating needs embreex: pip install -e '.[simulate]'")
+    from links.simulated.rig.live_process import RealTimeRig
+    from links.simulated.rig.live_rig import LiveRigSettings
+
+    (tmp_path / "small.yaml").write_text(SCENARIO)
+    settings = LiveRigSettings(
+        scenario=tmp_path / "small.yaml",
+        servo=tmp_path / "servo",
+        lidar_port=ports[0],
+        lidar_model=unit["model"],
+        lidar_beams=unit.get("beams"),
+    )
+    rig, ready = RealTimeRig(settings, tmp_path), threading.Event()
+    sending = threading.Thread(target=rig.run, args=(ready,), daemon=True)
+    lidar = Lidar(port=ports[0], timeout_s=60, slice_ms=0.1, unit=unit)
+    with lidar.listen() as packets:
+        sending.start()
+        assert ready.wait(PATIENCE_S)
+        records = [next(packets) for _ in range(60)]
+        firings = [f for record in records if (f := lidar.decode(record)) is not None]
+    rig.stop.set()
+    sending.join(PATIENCE_S)
+    assert lidar.counters.rejected == {}
+    assert len(firings) > 30
+    assert np.concatenate([f.range_m for f in firings]).max() > 5.0
+    now_ns = host_time.now_ns()
+    assert all(abs(f.pulse_stamp_ns[-1] - now_ns) < 60 * 10**9 for f in firings)
+    truth = rig_of(tmp_path / "truth.mcap")
+    assert truth["lidar"]["model"] == unit["model"]
+
+
+def rig_of(recording):
+    with RecordingReader(recording) as reader:
+        return yaml.safe_load(reader.rig_yaml)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rig", ["xt16", "os1_32_example"])
+def test_the_field_stack_finds_the_drone_with_another_lidar(rig, tmp_path):
+    """Needs a machine that simulates this LiDAR in real time: two idle cores."""
+    pytest.importorskip("embreex", reason="simulating needs embreex: pip install -e '.[simulate]'")
+    config = tmp_path / "live.yaml"
+    text = (ROOT / "configs" / "sim_live_xt16.yaml").read_text().replace("rigs/xt16.yaml", f"rigs/{rig}.yaml")
+    config.write_text(text.replace("[sim_live.yaml, rigs/", f"[{ROOT}/configs/sim_live.yaml, {ROOT}/configs/rigs/"))
+    grd = [sys.executable, "-c", "from links.cli import main; main()"]
+    flight = tmp_path / "flight"
+    run = [*grd, "run", str(config), "--for", "15", "--out", str(flight)]
+    done = subprocess.run(run, cwd=ROOT, capture_output=True, text=True, timeout=900, check=False)
+    report, live = json.loads((flight / "rig.json").read_text()), json.loads((flight / "summary.json").read_text())
+    print(report, live["live"]["edges"]["track.pulses"], done.stdout)  # noqa: T201
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert report["packets_skipped"] < 0.05 * report["packets"]
+    assert live["messages"]["track.drone_fix"] > 20
+
+
 @pytest.mark.slow
 def test_the_field_stack_flies_with_the_simulated_rig_and_is_replayed_to_its_hash(tmp_path):
     pytest.importorskip("embreex", reason="simulating needs embreex: pip install -e '.[simulate]'")

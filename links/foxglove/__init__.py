@@ -1,0 +1,3 @@
+"""Recordings and runs for Foxglove, with its own message schemas."""
+
+from links.foxglove.export import export as export

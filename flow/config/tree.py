@@ -183,7 +183,7 @@ def _read(file: Path, tree: Tree, including: tuple[Path, ...]) -> Tree:
 
 
 def _similar_file(file: Path) -> str:
-    """` Did you mean 'x.yaml'?` for the YAML file beside `file` whose name is the most similar, or nothing."""
+    """` Did you mean 'x.yaml'?` for the YAML file next to `file` whose name is the most similar, or nothing."""
     names = {p.stem: p.name for p in file.parent.glob("*.y*ml")} if file.parent.is_dir() else {}
     found = difflib.get_close_matches(file.stem, names, n=1)
     return f" Did you mean '{names[found[0]]}'?" if found else ""

@@ -122,7 +122,7 @@ def hovering(flight: ImuFlight) -> Position:
 
 
 def formation_until(flight: ImuFlight, until_s: float, leaves_mps: float = 1.0) -> Position:
-    """Of a drone 5 m beside this one, which leaves it with a constant velocity from a time on."""
+    """Of a drone 5 m from this one, which leaves it with a constant velocity from a time on."""
 
     def position(t: float) -> np.ndarray:
         return flight.truth(t)[1] + [5.0, max(t - until_s, 0.0) * leaves_mps, 0.0]

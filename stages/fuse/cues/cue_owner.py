@@ -8,7 +8,7 @@ change of the cue is compared with that of the drone:
     stands     minus the vehicle's displacement: an object that stands (POSITION only)
     flies      any change, FLIES_MPS an axis
 
-A drone that hovers over its vehicle cannot be distinguished from another one that hovers: its cue is not used until it moves.
+A drone that hovers over its vehicle looks like another one that hovers: its cue is not used until it moves.
 
 Source: Bar-Shalom, Li, Kirubarajan (2001), 11.6 (static multiple model); ours.
 """

@@ -132,7 +132,7 @@ def test_the_rig_sends_the_packets_of_another_lidar(unit, tmp_path, ports):
     with lidar.listen() as packets:
         sending.start()
         assert ready.wait(PATIENCE_S)
-        records = [next(packets) for _ in range(60)]
+        records = [next(packets) for _ in range(260)]  # a turn: 2000 columns, 8 in a packet of the XT16
         firings = [f for record in records if (f := lidar.decode(record)) is not None]
     rig.stop.set()
     sending.join(PATIENCE_S)

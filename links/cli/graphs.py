@@ -51,10 +51,12 @@ def check(config: Config, overlay: Overlay = None, sets: Sets = None, hosts: Hos
             err.print(str(entry), markup=False, style="red")
         raise typer.Exit(EXIT_FAILED) from None
     stages = sum(spec.kind == "stages" for spec in graph.nodes.values())
-    out.print(f"{config}: {stages} stages, {len(graph.nodes) - stages} links, {len(graph.edges)} edges, no problems")
+    as_shipped = shipped_values(graph)
+    found = f"no errors, {len(as_shipped)} settings as shipped" if as_shipped else "no problems"
+    out.print(f"{config}: {stages} stages, {len(graph.nodes) - stages} links, {len(graph.edges)} edges, {found}")
     for text in graph.left_out_texts():
         out.print(text, markup=False)
-    for text in shipped_values(graph):
+    for text in as_shipped:
         warn(text)
     if placed is not None:
         _print_hosts(placed)

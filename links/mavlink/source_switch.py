@@ -52,7 +52,7 @@ FALLBACK_AFTER_NS = 500_000_000  # without a pose; ArduPilot times out after 0.3
 MAX_FIX_AGE_NS = 1_000_000_000  # age of the LiDAR position in a pose
 MAX_STATUS_AGE_NS = 2_000_000_000  # age of the EKF's status
 MAX_RATIO = 0.5  # test ratio; above 1 the EKF rejects
-MAX_TURNED_MPS = 1.0  # ours: an error of velocity that position control removes within a few metres
+MAX_TURNED_MPS = 1.0  # ours, chosen: error of the EKF's velocity after a change of axes
 TRIES = 3
 PARAMETER_PERIOD_NS, PARAMETER_RETRY_PERIOD_NS = 200_000_000, 10_000_000_000  # of requests, and after TRIES of each
 USING = re.compile(r"Using EKF Source Set (\d)")
@@ -87,7 +87,7 @@ class SourceSwitch:
         self._status: tuple[int, Any] | None = None  # arrival and message
         self._position_ns = 0  # newest LOCAL_POSITION_NED
         self._speed_mps = 0.0  # of it, horizontal
-        self._turn_rad = 0.0  # from the autopilot's axes by its own sources to those of the poses
+        self._turn_rad = math.pi  # from the autopilot's axes by its own sources to those of the poses; at first unknown
         self._too_fast = False  # set 1 is due, see `_is_slow`
         self._blocked = ""  # why grd's set is not requested any more
         self._pending: tuple[int, int] | None = None  # the set requested, and when
@@ -134,8 +134,9 @@ class SourceSwitch:
             self._sending_ns = now_ns
             self.agreement.restart()
         self._sent, self._sent_ns, self._too_fast = pose, now_ns, False
-        if self.active == FIRST_SET and pose.odom_yaw_rad is None:
-            self._turn_rad = odom_yaw_rad(pose, autopilot) or 0.0
+        if self.active == FIRST_SET:
+            turn_rad = odom_yaw_rad(pose, autopilot) if pose.odom_yaw_rad is None else 0.0
+            self._turn_rad = self._turn_rad if turn_rad is None else turn_rad
         off_m = self.agreement.add(pose, autopilot)
         if off_m is not None and self.active != self._set:
             self._warn(f"pose and autopilot differ by {off_m:.1f} m")

@@ -7,11 +7,10 @@ Residuals that neither bias nor noise explains, all of CONTRADICTS_NS and at lea
 is of another drone, or its sensor has failed. It is trusted again after AGREES_NS in which all agree, and at least
 three do.
 
-The bias learns only from residuals that agree. Agreements and contradictions are counted in measurements, not in time:
-a cue at 1 Hz is distrusted after 3 s and trusted again after 10 s, one at 10 Hz in a tenth of it.
+The bias learns only from residuals that agree.
 
-Source: ours (also CONTRADICTIONS and AGREEMENTS, chosen, not measured); Brown, Hwang, Introduction to Random Signals
-and Applied Kalman Filtering, ch. 3 (Gauss-Markov).
+Source: ours (also LEAST, CONTRADICTS_NS and AGREES_NS, chosen, not measured); Brown, Hwang, Introduction to Random
+Signals and Applied Kalman Filtering, ch. 3 (Gauss-Markov).
 """
 
 from __future__ import annotations

@@ -58,7 +58,7 @@ class RangingSettings(StrictModel):
 
 
 class BarometerSettings(StrictModel):
-    """The drone's altitude above home by its autopilot's estimator, which is the road at the vehicle's start."""
+    """The drone's altitude by its autopilot's estimator, above home: the road at the vehicle's start."""
 
     drift_m: float = Field(default=1.0, ge=0, le=100)
     drift_time_s: float = Field(default=120.0, gt=1)

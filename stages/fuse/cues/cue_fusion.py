@@ -9,8 +9,9 @@ While the LiDAR sees the drone, a cue gives its bias and nothing else of weight.
 IMU. A wrong cue could then move the estimate slowly, each step within the ellipsoid. Therefore the state by the IMU
 alone is propagated from the newest LiDAR position. The estimate continues with that when a measurement is beyond its
 95 % ellipsoid, bias and noise included, when the cue is rejected, or when the next LiDAR position agrees with the IMU
-alone. The test is strict because a false alarm costs little. Undetected, a wrong cue moves the estimate by at most
-q s^2 / r: q = 2.8, r^2 = s^2 + c^2, s and c: sigmas of the IMU alone and of the cue.
+alone. The test is strict because a false alarm costs little. A wrong cue that passes it is off by at most q r, and
+moves the estimate by the share s^2 / r^2 of that: q = sqrt(7.81), r^2 = s^2 + c^2, s and c: sigmas [m] of the IMU
+alone and of the cue.
 
 Source: ours.
 """
@@ -21,6 +22,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from stages.cues.bias import CHI2_999
 from stages.fuse.consistency import InformationInflation
 from stages.fuse.cues.cue_owner import CueOwner
 from stages.fuse.cues.cue_states import CueStates, Innovation, SlowState
@@ -30,8 +32,7 @@ from stages.geometry.trajectory import VehicleTrajectory
 from stages.heading.inertial_state import InertialState
 from stages.messages import CueFactor, DroneCue
 
-CHI2_95 = {1: 3.84, 2: 5.99, 3: 7.81}
-CHI2_999 = {1: 10.83, 2: 13.82, 3: 16.27}  # 99.9 % quantiles by degrees of freedom
+CHI2_95 = {1: 3.84, 2: 5.99, 3: 7.81}  # 95 % quantiles by degrees of freedom
 SEEN_NS = 350_000_000  # after a LiDAR position
 OLDEST_NS = 1_500_000_000  # before the graph's time: within the shortest lag that the default of 2 s leaves
 CONTRADICTS_NS = 500_000_000

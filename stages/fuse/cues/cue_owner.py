@@ -42,10 +42,8 @@ class CueOwner:
     """Probabilities of the four hypotheses."""
 
     def __init__(self) -> None:
-        self._probability, self._from = PRIOR.copy(), None
-
-    _probability: Array64
-    _from: _Sample | None
+        self._probability: Array64 = PRIOR.copy()
+        self._from: _Sample | None = None
 
     @property
     def certain(self) -> bool:

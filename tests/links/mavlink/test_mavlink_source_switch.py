@@ -20,6 +20,7 @@ from links.mavlink.poses.gate import PoseLimits
 from links.mavlink.profiles import required_parameters
 from links.mavlink.source_switch import SET_EKF_SOURCE_SET, SourceSwitch
 from links.mavlink.transport.framing import packed, parse_frame
+from links.simulated.autopilot.flight_stack.stack import FlightStack
 from links.simulated.rig.closed_loop import load_loop
 from links.simulated.rig.pose_loop import PEER, VirtualConnection
 from links.simulated.rig.run import Simulation
@@ -343,24 +344,28 @@ def test_over_a_socket_the_request_is_made_and_its_acknowledgement_read(monkeypa
     assert listener.link.counters["source sets requested"] == 1
 
 
+def flown(config: Path, name: str, stack_settings: dict[str, Any], gap_s: tuple[float, float]) -> FlightStack:
+    """A flight of a scenario until the end of a gap of the LiDAR."""
+    scenario = load_scenario(ROOT / f"configs/scenarios/flight/{name}.yaml")
+    assert scenario.autopilot is not None
+    autopilot = scenario.autopilot.model_dump()
+    autopilot["flight_stack"] |= stack_settings
+    scenario = scenario.changed(duration_s=gap_s[1], autopilot=autopilot, lidar_gaps_s=(gap_s,))
+    simulation = Simulation(scenario, loop=load_loop(config, scenario.rig_yaml(), "test", scenario.closed_loop))
+    for _ in simulation.records():
+        pass
+    assert simulation.flight is not None
+    return simulation.flight.stack
+
+
 def test_a_flight_is_switched_to_grd_and_back_to_gps_when_the_lidar_ends(tmp_path: Path):
     config = tmp_path / "switch.yaml"
     include = ROOT / "configs/sim_flight_fixes.yaml"
     config.write_text(
         f"include: {include}\nlinks: {{autopilot: {{config: {{switch_source: true}}}}}}\n", encoding="utf-8"
     )
-    scenario = load_scenario(ROOT / "configs/scenarios/flight/hover_fixes.yaml")
-    assert scenario.autopilot is not None
-    autopilot = scenario.autopilot.model_dump()
-    autopilot["flight_stack"]["plan"] = [{"do": "path", "for_s": 60}]
-    scenario = scenario.changed(duration_s=27.0, autopilot=autopilot, lidar_gaps_s=((21.0, 27.0),))
-    simulation = Simulation(scenario, loop=load_loop(config, scenario.rig_yaml(), "test", scenario.closed_loop))
-    for _ in simulation.records():
-        pass
-    assert simulation.flight is not None
-    stack = simulation.flight.stack
-    events = [str(event) for event in stack.events]
-    assert events == ["plan: path", "source set 2", "source set 1"]
+    stack = flown(config, "hover_fixes", {"plan": [{"do": "path", "for_s": 60}]}, (21.0, 27.0))
+    assert [str(event) for event in stack.events] == ["plan: path", "source set 2", "source set 1"]
     assert not stack.quadrotor.crashed
 
 
@@ -380,20 +385,8 @@ def test_a_set_is_requested_only_while_the_velocity_in_the_turned_axes_is_nearly
 
 def test_a_flight_that_follows_the_vehicle_at_speed_is_not_switched_to_gps_in_turned_axes():
     config = ROOT / "configs/sim_flight_switch_fixes.yaml"
-    scenario = load_scenario(ROOT / "configs/scenarios/flight/follow_fixes.yaml")
-    assert scenario.autopilot is not None
-    autopilot = scenario.autopilot.model_dump()
-    autopilot["flight_stack"]["plan"] = [
-        {"do": "path", "for_s": 20},
-        {"do": "square", "for_s": 11, "side_m": 8.0},
-        {"do": "follow", "for_s": 20},
-    ]
-    autopilot["flight_stack"]["source_sets"] = ["gps", "external_no_velocity"]
-    scenario = scenario.changed(duration_s=40.0, autopilot=autopilot, lidar_gaps_s=((34.0, 40.0),))
-    simulation = Simulation(scenario, loop=load_loop(config, scenario.rig_yaml(), "test", scenario.closed_loop))
-    for _ in simulation.records():
-        pass
-    assert simulation.flight is not None
-    stack = simulation.flight.stack
+    square = {"do": "square", "for_s": 11, "side_m": 8.0}
+    plan = [{"do": "path", "for_s": 20}, square, {"do": "follow", "for_s": 20}]
+    stack = flown(config, "follow_fixes", {"plan": plan, "source_sets": ["gps", "external_no_velocity"]}, (34.0, 40.0))
     assert [str(event) for event in stack.events] == ["plan: path", "plan: square", "source set 2", "plan: follow"]
     assert not stack.quadrotor.crashed

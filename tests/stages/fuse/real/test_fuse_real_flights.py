@@ -109,6 +109,13 @@ def report(flown: list[Flown]) -> None:
         f"all: {row('', '', flown)}\n{100 * full.mean():.0f} % with a rotation; {100 * np.mean(np.abs(yaw) > WRONG_DEG):.1f} % "
         f"of these more than 10 deg off, in {sum(bool(np.any(np.abs(one.yaw_deg) > WRONG_DEG)) for one in flown)} of {len(flown)} flights"
     )
+    sigma_deg, poses = np.concatenate([one.yaw_sigma_deg for one in flown]), sum(len(one.at_s) for one in flown)
+    for limit_deg in (4.0, 3.5):
+        kept = yaw[sigma_deg <= limit_deg]
+        text = (
+            f"{100 * len(kept) / poses:.0f} % with a rotation; {100 * np.mean(np.abs(kept) > WRONG_DEG):.1f} % of these"
+        )
+        print(f"  with a limit of {limit_deg} deg: {text}")  # noqa: T201
     for a in range(0, 60, 10):
         inside = (at_s >= a) & (at_s < a + 10)
         if inside.any():

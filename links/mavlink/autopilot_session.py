@@ -138,8 +138,6 @@ class AutopilotSession:
 
     def send_pose(self, pose: RelativePose) -> None:
         """Send a pose, or reject it. Never blocks."""
-        if self.poses.sends_yaw:  # the autopilot adopts it: the yaw of its axes is no longer the one that was learnt
-            pose = dataclasses.replace(pose, odom_yaw_rad=None, odom_yaw_sigma_rad=None)
         with self._lock:
             now_ns = self._now_ns()
             self._send_periodic(now_ns)
@@ -148,7 +146,7 @@ class AutopilotSession:
             if sent:
                 self.poses.on_sent(pose, now_ns, sent)
                 if any(message.get_type() in POSES for message in sent):
-                    self.switch.on_sent(pose, self.poses.autopilot, now_ns)
+                    self.switch.on_sent(pose, self.poses.axes_yaw_rad or 0.0, self.poses.autopilot, now_ns)
             self._send_texts(now_ns)
 
     def sent(self) -> list[Record]:
@@ -345,6 +343,8 @@ class AutopilotSession:
 
     def _send(self, message: Any, pose: RelativePose | None = None) -> bool:
         """Send one message, of a pose if it is one. The lock is held."""
+        if pose is not None and self.poses.sends_yaw:  # a restart needs the yaw that its ATTITUDE has, right or wrong
+            pose = dataclasses.replace(pose, odom_yaw_rad=None, odom_yaw_sigma_rad=None)
         return self._sender.send(
             message, None if pose is None else lambda: odom_frame(pose, self.poses.autopilot, self._own)
         )

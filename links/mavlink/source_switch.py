@@ -7,7 +7,7 @@ The switch to grd's set is requested (MAV_CMD_SET_EKF_SOURCE_SET) while all of t
     poses have been sent for MIN_SENDING_NS, and the newest contains a LiDAR position of the last second
     its EKF reports its state, and no test ratio of position or velocity above MAX_RATIO
     the poses move as its own estimate does (`poses/agreement.py`), unless its EKF has no position to compare
-    it is slow enough for the turn of the axes, see below
+    it is slow enough for the angle between both axes, see below
 
 A request that is denied, or that is not acknowledged three times, is not repeated until the autopilot boots. Nor is any
 after somebody else has selected another set: ArduPilot names a set that its remote control selects in a STATUSTEXT. It
@@ -18,10 +18,11 @@ from another source than grd. ArduPilot alone does not return to it. Without a c
 nothing is requested: the pilot has to switch. Neither does grd that was restarted in flight request set 1 before it has
 requested its own set again, because it does not know which set is in use.
 
-Poses with yaw are in axes that are not the autopilot's. With the source of the yaw the EKF turns its axes, but not its
-velocity: NavEKF3_core::SelectVelPosFusion resets the position alone, and a velocity that is wrong by less than the gate
-(5 sigma, some 4 m/s) is not reset either but flown with. So no set is requested, set 1 neither, while the velocity in
-the turned axes would be wrong by more than MAX_TURNED_MPS.
+Poses with yaw are in axes parallel to those that the autopilot had at the first one. If its EKF has reset its yaw since,
+they are not parallel any more. With the source of the yaw the EKF turns its axes, but not its velocity:
+NavEKF3_core::SelectVelPosFusion resets the position alone, and a velocity that is wrong by less than the gate (5 sigma,
+some 4 m/s) is not reset either but flown with. So no set is requested, set 1 neither, while the velocity in the turned
+axes would be wrong by more than MAX_TURNED_MPS.
 
 Source: ours; ArduPilot GCS_MAVLINK::handle_command_set_ekf_source_set, RC_Channel::do_aux_function (EKF_SOURCE_SET),
 ArduCopter mode.h (numbers of modes), NavEKF3_core::send_status_report.
@@ -126,8 +127,8 @@ class SourceSwitch:
         elif is_answer(message, SET_EKF_SOURCE_SET, self._own):
             self._on_result(message.result)
 
-    def on_sent(self, pose: RelativePose, autopilot: AutopilotEstimate, now_ns: int) -> None:
-        """A pose was sent; `autopilot`: its newest estimate."""
+    def on_sent(self, pose: RelativePose, axes_yaw_rad: float, autopilot: AutopilotEstimate, now_ns: int) -> None:
+        """A pose was sent in axes of this yaw in `map`; `autopilot`: its newest estimate."""
         if self._set is None:
             return
         if self._sending_ns is None or now_ns - self._sent_ns > FALLBACK_AFTER_NS:
@@ -135,9 +136,9 @@ class SourceSwitch:
             self.agreement.restart()
         self._sent, self._sent_ns, self._too_fast = pose, now_ns, False
         if self.active == FIRST_SET:
-            turn_rad = odom_yaw_rad(pose, autopilot) if pose.odom_yaw_rad is None else 0.0
-            self._turn_rad = self._turn_rad if turn_rad is None else turn_rad
-        off_m = self.agreement.add(pose, autopilot)
+            own_yaw_rad = odom_yaw_rad(pose, autopilot)
+            self._turn_rad = self._turn_rad if own_yaw_rad is None else axes_yaw_rad - own_yaw_rad
+        off_m = self.agreement.add(pose, axes_yaw_rad, autopilot)
         if off_m is not None and self.active != self._set:
             self._warn(f"pose and autopilot differ by {off_m:.1f} m")
 

@@ -1,13 +1,12 @@
 """Whether the poses that are sent move as the autopilot's own estimate does.
 
-Displacements since a reference time are compared, in the autopilot's axes, because its frame has another origin:
+Displacements since a reference time are compared, because the autopilot's frame has another origin:
 
-    | R_odom_map (p - p_0) - (x - x_0) | <= tolerance        p: sent position (map), x: the autopilot's position (odom)
+    | R_sent_map (p - p_0) - (x - x_0) | <= tolerance        p: position (map), x: the autopilot's position (odom)
 
-The tolerance is 3 sigma of both positions. They agree once the drone has moved horizontally by twice the tolerance:
-then a pose of a static object, of another drone or with a yaw that is 30 deg wrong exceeds it (2 sin(30 deg / 2) of the
-way is 1.04 tolerances). R_odom_map is the yaw of the autopilot's axes of positions without yaw; for poses with yaw it
-is the difference of both yaws of the body, so that a wrong compass disagrees, too.
+R_sent_map turns `map` into the axes that positions are sent in. The tolerance is 3 sigma of both positions. They agree
+once the drone has moved horizontally by twice the tolerance: then a pose of a static object, of another drone or in
+axes that are 30 deg off exceeds it (2 sin(30 deg / 2) of the way is 1.04 tolerances).
 
 While the autopilot flies by another source, its estimate is evidence. Once it flies on the poses, it contains them:
 both then agree whatever they are, and the result is not used any more (`source_switch.py`).
@@ -24,7 +23,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from links.mavlink.poses.autopilot_estimate import AutopilotEstimate
-from links.mavlink.poses.odom_frame import odom_yaw_rad
 from stages.geometry.frames import Array64, rotation_z
 from stages.messages import RelativePose
 
@@ -57,11 +55,13 @@ class MotionAgreement:
         """The autopilot has booted, or poses were not sent for a while."""
         self._reference = self._agreed_ns = None
 
-    def add(self, pose: RelativePose, autopilot: AutopilotEstimate) -> float | None:
-        """Add a pose that was sent, and the autopilot's newest estimate; returns the distance [m] when it disagrees."""
-        yaw_rad = odom_yaw_rad(pose, autopilot)
+    def add(self, pose: RelativePose, axes_yaw_rad: float, autopilot: AutopilotEstimate) -> float | None:
+        """Add a pose that was sent, and the autopilot's newest estimate; returns the distance [m] when it disagrees.
+
+        `axes_yaw_rad`: yaw in `map` of the axes that it was sent in.
+        """
         xyz_odom_m = None if autopilot.position is None else autopilot.position.at(pose.stamp_ns)
-        if pose.xyz_map_m is None or yaw_rad is None or xyz_odom_m is None:
+        if pose.xyz_map_m is None or xyz_odom_m is None:
             return None
         first = self._reference
         if first is None or pose.resets != first.resets or pose.track_id != first.track_id:
@@ -69,7 +69,7 @@ class MotionAgreement:
             self._start(pose, xyz_odom_m)
             return None
         moved_m = xyz_odom_m - first.xyz_odom_m
-        off_m = float(np.linalg.norm(rotation_z(-yaw_rad) @ (pose.xyz_map_m - first.xyz_map_m) - moved_m))
+        off_m = float(np.linalg.norm(rotation_z(-axes_yaw_rad) @ (pose.xyz_map_m - first.xyz_map_m) - moved_m))
         if off_m > self.tolerance_m:
             self.disagreements += 1
             self._agreed_ns = None

@@ -28,6 +28,7 @@ MIN_YAW_RESET_RAD, UNEXPLAINED_SHARE = math.radians(8.0), 0.3  # unexplained cha
 MAX_ATTITUDE_GAP_MS = 1000  # the rates do not explain the yaw over a longer gap
 MIN_BOOT_STEP_MS = 1000  # time since boot that runs backwards by more is another boot; by less, a late frame
 STEEP_RAD = math.radians(60.0)  # pitch or roll beyond which yaw is not evaluated
+MAX_ATTITUDE_AGE_NS = 1_000_000_000  # of its attitude against a pose
 MAX_POSITION_AGE_NS = 300_000_000  # of its position against a pose; it is extrapolated by its velocity
 
 

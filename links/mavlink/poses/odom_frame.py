@@ -22,7 +22,7 @@ from links.mavlink.ned_frd import (
     upper_from_pose_covariance,
     wxyz_from_R_odom_drone,
 )
-from links.mavlink.poses.autopilot_estimate import AutopilotEstimate
+from links.mavlink.poses.autopilot_estimate import MAX_ATTITUDE_AGE_NS, AutopilotEstimate
 from links.mavlink.poses.pose_messages import BODY_FRD, LOCAL_FRD, UNKNOWN_COVARIANCE, VIO
 from links.mavlink.readers import read_odometry
 from links.mavlink.transport.framing import dialect
@@ -32,11 +32,13 @@ from stages.messages import EarlierOdomFrame, PoseEstimate, RelativePose
 
 
 def odom_yaw_rad(pose: RelativePose, autopilot: AutopilotEstimate) -> float | None:
-    """Yaw of the autopilot's axes in `map`; None: not known."""
+    """Yaw of the autopilot's axes in `map`: as learnt, or the difference of both yaws of the body; None: not known."""
     attitude = autopilot.attitude
     if pose.odom_yaw_rad is not None:
         return pose.odom_yaw_rad
     if attitude is None or not isinstance(pose.estimate, PoseEstimate):
+        return None
+    if abs(pose.stamp_ns - attitude.arrival_ns) > MAX_ATTITUDE_AGE_NS:
         return None
     R_odom_drone = R_odom_drone_from_rpy(attitude.roll_rad, attitude.pitch_rad, attitude.yaw_rad)
     return heading_rad(pose.estimate.R_map_drone) - heading_rad(R_odom_drone)

@@ -1,7 +1,13 @@
 """MAVLink messages of a pose with rotation: ODOMETRY, VISION_POSITION_ESTIMATE and LANDING_TARGET.
 
-ODOMETRY and VISION_POSITION_ESTIMATE contain the drone's pose in the vehicle's *start* frame, which is static while the
-vehicle drives, as an EKF requires. Its x axis is the vehicle's forward direction at the start, not north: LOCAL_FRD.
+ODOMETRY and VISION_POSITION_ESTIMATE contain the drone's pose with the origin of `map`, which is static while the vehicle
+drives, as an EKF requires, in axes that point as the autopilot's own did when the first pose was sent:
+
+    p_sent = Rz(axes_yaw)^T p_map,   R_sent_drone = Rz(axes_yaw)^T R_map_drone
+
+axes_yaw is constant, so that an error of the autopilot's heading at that time turns the axes and adds no error to a
+pose in them. Then a switch between its own sources and grd turns neither its attitude nor its velocity by more than
+that heading has changed since. The frame is LOCAL_FRD, not LOCAL_NED: the yaw is not relative to the true north.
 Positions without yaw: `position_messages.py`. LANDING_TARGET contains the vehicle's position in the drone's body frame.
 
     p_drone_vehicle = -R_vehicle_drone^T t_vehicle_drone
@@ -29,6 +35,7 @@ from links.mavlink.ned_frd import (
 )
 from links.mavlink.poses.gate import PoseLimits, worst_sigmas
 from links.mavlink.transport.framing import SEQUENCE, dialect
+from stages.geometry.frames import Array64, rotation_z
 from stages.messages import PoseEstimate, RelativePose
 
 LOCAL_FRD, BODY_FRD = 20, 12  # MAV_FRAME: the only ones that ArduPilot accepts in ODOMETRY
@@ -46,15 +53,15 @@ def quality_percent(pose: PoseEstimate, limits: PoseLimits) -> int:
     return max(1, min(100, round(100 * (1 - worst))))
 
 
-def odometry(pose: RelativePose, reset_counter: int, limits: PoseLimits) -> Any:
-    """ODOMETRY of a pose that the gate has accepted."""
+def odometry(pose: RelativePose, axes_yaw_rad: float, reset_counter: int, limits: PoseLimits) -> Any:
+    """ODOMETRY of a pose that the gate has accepted; `axes_yaw_rad`: yaw in `map` of the axes that it is sent in."""
     estimate = _estimate(pose)
-    R = estimate.R_map_drone
+    xyz_m, R = _in_axes(estimate, axes_yaw_rad)
     return dialect().MAVLink_odometry_message(
         pose.stamp_ns // 1000,
         LOCAL_FRD,
         BODY_FRD,
-        *flip_yz(estimate.xyz_map_m),
+        *flip_yz(xyz_m),
         wxyz_from_R_odom_drone(R),
         *UNKNOWN,  # velocity
         *UNKNOWN,  # angular velocity: the autopilot's gyros are better
@@ -66,13 +73,13 @@ def odometry(pose: RelativePose, reset_counter: int, limits: PoseLimits) -> Any:
     )
 
 
-def vision_position_estimate(pose: RelativePose, reset_counter: int) -> Any:
-    """VISION_POSITION_ESTIMATE of a pose that the gate has accepted; for ArduPilot only, PX4 assumes north."""
+def vision_position_estimate(pose: RelativePose, axes_yaw_rad: float, reset_counter: int) -> Any:
+    """VISION_POSITION_ESTIMATE of a pose that the gate has accepted; for ArduPilot only, PX4 assumes true north."""
     estimate = _estimate(pose)
-    R = estimate.R_map_drone
+    xyz_m, R = _in_axes(estimate, axes_yaw_rad)
     return dialect().MAVLink_vision_position_estimate_message(
         pose.stamp_ns // 1000,
-        *flip_yz(estimate.xyz_map_m),
+        *flip_yz(xyz_m),
         *rpy_from_R_odom_drone(R),
         upper_from_pose_covariance(estimate.map_covariance, R),
         reset_counter % SEQUENCE,
@@ -104,6 +111,12 @@ def landing_target(pose: RelativePose) -> Any:
         VISION_OTHER,
         1,
     )
+
+
+def _in_axes(estimate: PoseEstimate, axes_yaw_rad: float) -> tuple[Array64, Array64]:
+    """Position (3,) and rotation (3, 3) of the drone in axes with this yaw in `map`."""
+    R_axes_map = rotation_z(-axes_yaw_rad)
+    return R_axes_map @ estimate.xyz_map_m, R_axes_map @ estimate.R_map_drone
 
 
 def _estimate(pose: RelativePose) -> PoseEstimate:

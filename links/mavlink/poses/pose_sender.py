@@ -3,7 +3,9 @@
 `yaw` decides what ODOMETRY and VISION_POSITION_ESTIMATE contain, and which yaw source the autopilot needs:
 
     none      a position in the autopilot's own axes; its yaw comes from its compass. It needs no rotation of the drone
-    measured  a pose in `map` with yaw, while cameras or the raw IMU measure it; its yaw comes from grd alone
+    measured  a pose with yaw, while cameras or the raw IMU measure it; its yaw comes from grd alone. The axes are parallel
+              to the autopilot's own when the first pose since its boot is sent, and are then kept (`pose_messages.py`);
+              if it has not reported them, they are those of `map`
 
 The reset counter is incremented with every jump of the pose, every change of the drone, and after every pause that the
 autopilot noticed, so that it resets to the new pose instead of gating it. Its initial value is arbitrary: after a
@@ -19,12 +21,13 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-from links.mavlink.poses.autopilot_estimate import AutopilotEstimate
+from links.mavlink.poses.autopilot_estimate import MAX_ATTITUDE_AGE_NS, AutopilotEstimate
 from links.mavlink.poses.fusion_monitor import FusionMonitor, OnRejection
 from links.mavlink.poses.gate import PoseLimits, RejectReason, reject_reason
+from links.mavlink.poses.odom_frame import odom_yaw_rad
 from links.mavlink.poses.pose_messages import landing_target, odometry, vision_position_estimate
 from links.mavlink.poses.position_gate import gate_reason
 from links.mavlink.poses.position_messages import position_odometry, position_vision_estimate
@@ -37,7 +40,6 @@ from stages.messages import PoseState, RelativePose
 PoseMessage = Literal["odometry", "vision_position_estimate", "landing_target"]
 
 POSE_TIMEOUT_NS = 300_000_000  # the autopilot's timeout for poses
-MAX_ATTITUDE_AGE_NS = 1_000_000_000  # largest age of the autopilot's attitude
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +66,8 @@ class PoseSender:
         on_rejection: OnRejection = "stop",
     ) -> None:
         self.rejected: Counter[RejectReason] = Counter()
+        self.axes_yaw_rad: float | None = None
+        """Yaw in `map` of the axes that poses are sent in [rad]; None: none was sent since the autopilot's boot."""
         self.reset_counter = reset_counter % SEQUENCE
         self._kinds: tuple[PoseMessage, ...] = tuple(kinds)
         self._limits = limits
@@ -110,6 +114,7 @@ class PoseSender:
                 self._stop(reason.value)
         else:
             self._update_reset_counter(pose, now_ns)
+            self._update_axes(pose)
         return [self._message(kind, pose) for kind in sendable]
 
     def on_yaw_reset(self) -> None:
@@ -119,7 +124,7 @@ class PoseSender:
     def on_boot(self) -> None:
         """The autopilot has booted: its axes are others, and their yaw has to be learnt again before a pose is sent."""
         self._poses_sent = self._yaw_reset = False
-        self._other_boot_rad, self._first_map_m = self._odom_yaw_rad, None
+        self._other_boot_rad, self._first_map_m, self.axes_yaw_rad = self._odom_yaw_rad, None, None
         self.fusion.on_boot()
 
     def on_estimator_status(self, message: Any, now_ns: int) -> None:
@@ -163,6 +168,13 @@ class PoseSender:
             self.reset_counter = (self.reset_counter + 1) % SEQUENCE
             self._incremented = True
 
+    def _update_axes(self, pose: RelativePose) -> None:
+        if self.sends_yaw and self.axes_yaw_rad is not None:
+            return
+        if pose.odom_yaw_rad is not None and pose.odom_yaw_rad == self._other_boot_rad:
+            pose = replace(pose, odom_yaw_rad=None)
+        self.axes_yaw_rad = odom_yaw_rad(pose, self.autopilot) or 0.0
+
     def _reason(self, kind: PoseMessage, pose: RelativePose, now_ns: int) -> RejectReason | None:
         if kind == "landing_target":
             reason = reject_reason(pose, now_ns, self._limits)
@@ -199,9 +211,9 @@ class PoseSender:
         if kind != "landing_target" and self._yaw == "none":
             return self._position_message(kind, pose)
         if kind == "odometry":
-            return odometry(pose, self.reset_counter, self._limits)
+            return odometry(pose, self.axes_yaw_rad or 0.0, self.reset_counter, self._limits)
         if kind == "vision_position_estimate":
-            return vision_position_estimate(pose, self.reset_counter)
+            return vision_position_estimate(pose, self.axes_yaw_rad or 0.0, self.reset_counter)
         return landing_target(pose)
 
     def _position_message(self, kind: PoseMessage, pose: RelativePose) -> Any:

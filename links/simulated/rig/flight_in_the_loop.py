@@ -62,13 +62,15 @@ class FlightInTheLoop:
 
     def sent(self) -> list[Record]:
         """Frames that the host has sent since the last call; they go to the autopilot."""
-        frames = [] if self._loop is None else self._loop.sent()
+        if self._loop is None:
+            return []
+        frames = self._loop.sent()
         for frame in frames:
             if frame.stamp_ns != frame.arrival_ns:
                 continue  # of an earlier run: recorded again, not sent
             self.stack.receive(frame.data, frame.arrival_ns)
             if self._outcome is not None:
-                self._outcome.on_sent(frame)
+                self._outcome.on_sent(frame, self._loop.axes_yaw_rad)
         return frames
 
     def result(self) -> Outcome | None:

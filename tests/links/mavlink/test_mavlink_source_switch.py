@@ -17,6 +17,7 @@ from links.mavlink import Autopilot, source_switch
 from links.mavlink.poses.agreement import MotionAgreement
 from links.mavlink.poses.autopilot_estimate import AutopilotAttitude, AutopilotEstimate, AutopilotPosition
 from links.mavlink.poses.gate import PoseLimits
+from links.mavlink.poses.odom_frame import odom_yaw_rad
 from links.mavlink.profiles import required_parameters
 from links.mavlink.source_switch import SET_EKF_SOURCE_SET, SourceSwitch
 from links.mavlink.transport.framing import packed, parse_frame
@@ -54,6 +55,7 @@ class Flight:
         self.measured = True
         self.own_speed_mps = 1.0
         self.autopilot = AutopilotEstimate()
+        self.axes_yaw_rad: float | None = None
 
     def fly(self, seconds: float) -> Flight:
         for _ in range(round(50 * seconds)):
@@ -87,7 +89,10 @@ class Flight:
             measured_ns = self.now_ns if self.measured else self.now_ns - 2_000 * MS
             pose = dataclasses.replace(pose, odom_yaw_rad=None, measured_ns=measured_ns)
             self.autopilot.attitude = AutopilotAttitude(0.0, 0.0, self.compass_rad, self.now_ns)
-            self.switch.on_sent(pose, self.autopilot, self.now_ns)
+            if self.axes_yaw_rad is None:
+                self.axes_yaw_rad = odom_yaw_rad(pose, self.autopilot)
+                assert self.axes_yaw_rad is not None
+            self.switch.on_sent(pose, self.axes_yaw_rad, self.autopilot, self.now_ns)
 
     def _answer(self, request: Any) -> None:
         if request.get_type() == "PARAM_REQUEST_READ":
@@ -153,7 +158,7 @@ def test_a_drone_that_hovers_gives_no_evidence_that_its_poses_are_right():
     for _ in range(1500):
         now_ns += 20 * MS
         autopilot.position = AutopilotPosition(now_ns, np.array([1.0, 2.0, 3.0]), np.zeros(3))
-        assert agreement.add(good_pose(now_ns), autopilot) is None
+        assert agreement.add(good_pose(now_ns), 0.0, autopilot) is None
     assert not agreement.agrees(now_ns)
 
 
@@ -166,7 +171,7 @@ def agreed_after(ends: list[dict[str, Any]]) -> bool:
         autopilot.attitude = AutopilotAttitude(0.0, 0.0, 0.0, now_ns)
         changes = ends[step - 300] if step >= 300 else {}
         pose = dataclasses.replace(good_pose(now_ns, xyz_map_m=xyz_m, R_map_drone=np.eye(3)), odom_yaw_rad=None)
-        agreement.add(dataclasses.replace(pose, **changes), autopilot)
+        agreement.add(dataclasses.replace(pose, **changes), 0.0, autopilot)
     return agreement.agrees(now_ns)
 
 
@@ -369,12 +374,19 @@ def test_a_flight_is_switched_to_grd_and_back_to_gps_when_the_lidar_ends(tmp_pat
     assert not stack.quadrotor.crashed
 
 
-def test_a_set_is_requested_only_while_the_velocity_in_the_turned_axes_is_nearly_right():
+@pytest.mark.parametrize("turn_deg", [0.0, 90.0, 180.0])
+def test_the_yaw_of_map_does_not_matter(turn_deg: float):
     flight = Flight()
-    flight.turn_rad = math.radians(90)
+    flight.turn_rad = math.radians(turn_deg)
+    assert flight.fly(10).requested == [2]
+
+
+def test_after_a_yaw_reset_of_the_ekf_a_set_is_requested_only_while_the_velocity_in_its_axes_is_nearly_right():
+    flight = Flight().fly(1)
+    flight.compass_rad = math.radians(90)
     assert flight.fly(20).requested == []  # 1 m/s, wrong by 1.4 m/s
-    flight = Flight()
-    flight.turn_rad = math.radians(50)
+    flight = Flight().fly(1)
+    flight.compass_rad = math.radians(50)
     assert flight.fly(10).requested == [2]  # 0.8 m/s
     flight.poses, flight.own_speed_mps = False, 2.0
     assert flight.fly(5).requested == [2]
@@ -383,10 +395,10 @@ def test_a_set_is_requested_only_while_the_velocity_in_the_turned_axes_is_nearly
     assert flight.fly(1).requested == [2, 1]
 
 
-def test_a_flight_that_follows_the_vehicle_at_speed_is_not_switched_to_gps_in_turned_axes():
+def test_a_flight_that_follows_the_vehicle_at_speed_is_switched_to_gps_when_the_lidar_ends():
     config = ROOT / "configs/sim_flight_switch_fixes.yaml"
     square = {"do": "square", "for_s": 11, "side_m": 8.0}
     plan = [{"do": "path", "for_s": 20}, square, {"do": "follow", "for_s": 20}]
     stack = flown(config, "follow_fixes", {"plan": plan, "source_sets": ["gps", "external_no_velocity"]}, (34.0, 40.0))
-    assert [str(event) for event in stack.events] == ["plan: path", "plan: square", "source set 2", "plan: follow"]
+    assert [str(event) for event in stack.events] == ["plan: path", "plan: square", "source set 2", "plan: follow", "source set 1"]
     assert not stack.quadrotor.crashed

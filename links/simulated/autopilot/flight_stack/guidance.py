@@ -34,11 +34,10 @@ CORNER_STOP_S = 1.0
 
 @dataclass(frozen=True, slots=True)
 class SurveyFrame:
-    """Where the sources in use put the world frame: position and yaw may come from different ones."""
+    """Where the sources in use put the world frame."""
 
-    yaw_rad: float  # of the world's x axis in the frame of the position source
+    yaw_rad: float  # of the world's x axis
     xyz_m: Array64  # of the world's origin
-    heading_rad: float  # yaw of the world's x axis by the yaw source
 
     def position(self, world_m: Array64) -> Array64:
         """A position in the world frame, in the frame of the estimate."""
@@ -90,7 +89,7 @@ class Guidance:
         elif isinstance(step, GoTo):
             self._leg(self._from, frame.position(np.array(step.xyz_m)), step.speed_mps, since_s)
             if step.yaw_deg is not None:
-                self.target.yaw_rad = math.radians(step.yaw_deg) + frame.heading_rad
+                self.target.yaw_rad = math.radians(step.yaw_deg) + frame.yaw_rad
         elif isinstance(step, Square):
             self._square(step, since_s)
         elif isinstance(step, Follow):
@@ -102,7 +101,7 @@ class Guidance:
         row = min(round(since_s / TICK_S), len(yaw) - 2)
         self.target.xyz_m = frame.position(position[row])
         self.target.velocity_mps = rotate(velocity[row], frame.yaw_rad)
-        self.target.yaw_rad = float(yaw[row]) + frame.heading_rad
+        self.target.yaw_rad = float(yaw[row]) + frame.yaw_rad
         self.target.yaw_rate_radps = float(yaw[row + 1] - yaw[row]) / TICK_S
 
     def _leg(self, begin: Array64, end: Array64, speed_mps: float, since_s: float) -> float:

@@ -248,16 +248,13 @@ class FlightStack:
         return [SOURCE_SETS[name].position is AidingSource.EXTERNAL for name in self.settings.source_sets]
 
     def _frame(self) -> SurveyFrame:
-        """Where the sources in use put the world."""
+        """Where the sources in use put the world: all are in axes that point north, as far as the autopilot knows it."""
         sources = self.ekf.sources
-        home_yaw, map_yaw = self._world_yaw, -float(self._map[1])
-        external = sources.position is AidingSource.EXTERNAL
-        own_yaw = sources.yaw is not AidingSource.EXTERNAL  # then positions come in its own, north-aligned axes
-        yaw, origin = home_yaw if own_yaw else map_yaw, self._map[0] if external else self._home
-        xyz = -rotate(origin, yaw)
+        origin = self._map[0] if sources.position is AidingSource.EXTERNAL else self._home
+        xyz = -rotate(origin, self._world_yaw)
         if sources.height is not AidingSource.EXTERNAL:
             xyz[2] = -self._home[2]
-        return SurveyFrame(yaw, xyz, yaw)
+        return SurveyFrame(self._world_yaw, xyz)
 
     def _do_plan(self, time_s: float) -> None:
         while self._plan and time_s >= self._step_ends_s - 1e-9:

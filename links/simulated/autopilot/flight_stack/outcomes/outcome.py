@@ -84,10 +84,13 @@ class FlightOutcome:
         self._last: Array64 | None = None
         self._poses = SentPoses(truth, odometry, stack.north_yaw_of_map)
 
-    def on_sent(self, record: Record) -> None:
-        """A frame to the autopilot; after a crash none counts: the simulated IMU does not feel the impact."""
+    def on_sent(self, record: Record, axes_yaw_rad: float) -> None:
+        """A frame to the autopilot, whose axes have this yaw in `map` if it is a pose with yaw.
+
+        After a crash none counts: the simulated IMU does not feel the impact.
+        """
         if not self._stack.quadrotor.crashed:
-            self._poses.add(record)
+            self._poses.add(record, axes_yaw_rad)
 
     def is_over(self) -> bool:
         """Check the path since the last call for collisions and fly-aways; True: the flight was lost some time ago."""

@@ -1,8 +1,9 @@
 """Errors of the poses that were sent to the autopilot, and whether the covariances in the messages hold.
 
 Errors of a sent pose are those of ODOMETRY against T_map_vehicle T_vehicle_drone at its time: the first by the
-vehicle's odometry, whose drift the autopilot's frame shares, the second true. Without odometry both are true. A
-position that is sent without yaw is compared in axes that point to the true north. For statistics only.
+vehicle's odometry, whose drift the autopilot's frame shares, the second true. Without odometry both are true. Poses with
+yaw are compared in the axes that grd states for them. A position that is sent without yaw is compared in axes that
+point to the true north. For statistics only.
 
 Source: ours; 95 % quantiles of chi-squared with 3 and 1 degrees of freedom.
 """
@@ -45,7 +46,8 @@ class _SentPose:
     stamp_ns: int
     sent_ns: int
     xyz_m: Array64  # z up
-    yaw_rad: float  # in map; NaN: without yaw, and the position is in north-aligned axes
+    yaw_rad: float  # NaN: without yaw
+    axes_yaw_rad: float  # in map, of the axes of xyz_m and yaw_rad
     covariance_m2: Array64  # (3, 3), axes of xyz_m
     yaw_variance: float
 
@@ -61,8 +63,8 @@ class SentPoses:
     def __len__(self) -> int:
         return len(self._poses)
 
-    def add(self, record: Record) -> None:
-        """A frame to the autopilot."""
+    def add(self, record: Record, axes_yaw_rad: float) -> None:
+        """A frame to the autopilot. axes_yaw_rad: yaw in map of the axes of a pose with yaw."""
         message: Any = parse_frame(record.data)
         if message.get_type() != "ODOMETRY":
             return
@@ -73,10 +75,16 @@ class SentPoses:
         covariance[np.triu_indices(6)] = upper
         flip = np.array([1.0, -1.0, -1.0])
         position = (covariance + np.triu(covariance, 1).T)[:3, :3] * np.outer(flip, flip)
-        xyz = flip_yz(np.array([message.x, message.y, message.z]))
-        yaw = math.atan2(R[1, 0], R[0, 0])
         self._poses.append(
-            _SentPose(int(message.time_usec) * 1000, record.arrival_ns, xyz, yaw, position, float(upper[YAW_VARIANCE]))
+            _SentPose(
+                stamp_ns=int(message.time_usec) * 1000,
+                sent_ns=record.arrival_ns,
+                xyz_m=flip_yz(np.array([message.x, message.y, message.z])),
+                yaw_rad=math.atan2(R[1, 0], R[0, 0]),
+                axes_yaw_rad=axes_yaw_rad if has_yaw else -self._north_yaw,
+                covariance_m2=position,
+                yaw_variance=float(upper[YAW_VARIANCE]),
+            )
         )
 
     def longest_gap_s(self, until_ns: int) -> float | None:
@@ -95,10 +103,12 @@ class SentPoses:
         R_map, t_map = self._map_vehicle(stamps)
         expected_m = t_map + np.einsum("nij,nj->ni", R_map, relative_m)
         R_expected = R_map @ np.swapaxes(R_vehicle, 1, 2) @ R_drone
-        yaw = np.arctan2(R_expected[:, 1, 0], R_expected[:, 0, 0])
+        axes_yaw = np.array([pose.axes_yaw_rad for pose in self._poses])
+        yaw = np.arctan2(R_expected[:, 1, 0], R_expected[:, 0, 0]) - axes_yaw
         sent_yaw = np.array([pose.yaw_rad for pose in self._poses])
         without = np.isnan(sent_yaw)
-        expected_m[without] = expected_m[without] @ rotation_z(self._north_yaw).T
+        R_axes_map = np.array([rotation_z(-yaw_rad) for yaw_rad in axes_yaw.tolist()])
+        expected_m = np.einsum("nij,nj->ni", R_axes_map, expected_m)
         error_m = np.array([pose.xyz_m for pose in self._poses]) - expected_m
         covariances = np.array([pose.covariance_m2 for pose in self._poses])
         distance2 = np.einsum("ni,ni->n", error_m, np.linalg.solve(covariances, error_m[:, :, None])[:, :, 0])

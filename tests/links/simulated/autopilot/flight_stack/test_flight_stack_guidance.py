@@ -14,7 +14,7 @@ VEHICLE = Path(
     waypoints=(Waypoint(t_s=0, xyz_m=(0, 0, 0)), Waypoint(t_s=5, xyz_m=(0, 0, 0)), Waypoint(t_s=45, xyz_m=(200, 0, 0)))
 )
 START_M = np.array([4.0, 1.0, 10.0])
-FRAME = SurveyFrame(np.pi / 2, np.zeros(3), np.pi / 2)  # the world's x axis is the frame's y axis
+FRAME = SurveyFrame(np.pi / 2, np.zeros(3))  # the world's x axis is the frame's y axis
 
 
 def followed(drift_m_per_s: float, until_s: float) -> FlightTarget:
@@ -50,6 +50,6 @@ def test_follow_goes_on_from_the_shifted_target_when_the_axes_of_the_estimate_tu
     before_m = fly(guidance, 5.0, 25.0, FRAME).xyz_m.copy()
     jump_m = np.array([-30.0, 8.0, 0.0])
     guidance.shift(jump_m, -np.pi / 2)
-    target = fly(guidance, 25.0, 26.0, SurveyFrame(0.0, np.zeros(3), 0.0))
+    target = fly(guidance, 25.0, 26.0, SurveyFrame(0.0, np.zeros(3)))
     moved_m = np.diff(VEHICLE.at(np.array([25.0, 26.0]))[0][:, 0])[0]
     assert target.xyz_m == pytest.approx(before_m + jump_m + [moved_m, 0.0, 0.0])

@@ -8,12 +8,16 @@ import numpy as np
 import pytest
 
 from flow.link import Record
+from links.mavlink.ned_frd import R_odom_drone_from_wxyz, wxyz_from_R_odom_drone
 from links.simulated.autopilot.flight_stack.outcomes.outcome import FlightOutcome
 from links.simulated.sensors.vehicle_odometry import VehicleOdometry, VehicleOdometrySettings
 from links.simulated.world.mesh import RayScene, box
 from links.simulated.world.scene import Truth
 from stages.geometry.frames import rotation_z
 from tests.links.simulated.autopilot.flight_stack.sent_truth import PARKED, START_NS, Host
+
+
+NORTH = 30.0  # yaw of map in axes that point north [deg]
 
 
 def watched(host: Host, world: RayScene | None = None, odometry: VehicleOdometry | None = None) -> FlightOutcome:
@@ -34,7 +38,7 @@ def sent(host: Host, outcome: FlightOutcome, shift_m: float = 0.0, yaw_deg: floa
     host.edit = change
     now_ns = START_NS + host.ticks * 10_000_000
     frame = bytes(host.pose(now_ns).pack(host._mav))
-    outcome.on_sent(Record("/autopilot/tx", now_ns, now_ns, frame))
+    outcome.on_sent(Record("/autopilot/tx", now_ns, now_ns, frame), 0.0)
 
 
 @pytest.mark.parametrize(("shift_m", "yaw_deg", "wrong"), [(0.0, 0.0, 0), (1.5, 0.0, 1), (0.0, 15.0, 1), (0.7, 8.0, 0)])
@@ -74,23 +78,30 @@ def test_the_share_inside_is_that_of_the_covariance_in_the_message(
     assert (result.inside_share, result.yaw_inside_share) == inside
 
 
-def test_a_position_without_yaw_is_compared_in_north_aligned_axes() -> None:
-    host = Host(3.0)
+@pytest.mark.parametrize(("has_yaw", "turned_deg", "error_m"), [(True, 30.0, 0.0), (False, NORTH, 0.0), (False, 0.0, 3.6)])
+def test_a_pose_is_compared_in_the_axes_that_grd_states_a_position_in_axes_that_point_north(
+    has_yaw: bool, turned_deg: float, error_m: float
+) -> None:
+    """The drone is 6 to 7 m from the origin: 30 deg move it by 3.1 to 3.6 m."""
+    host = Host(3.0, autopilot={"heading_of_world_x_deg": -NORTH})
     outcome = watched(host)
     host.run(2.0)
-    north_yaw = host.stack.north_yaw_of_map
-    assert abs(math.sin(north_yaw)) > 0.1, "otherwise the test shows nothing"
+    assert math.degrees(host.stack.north_yaw_of_map) == pytest.approx(NORTH)
 
     def change(message, time_s: float) -> None:
-        x_north, y_west, _ = rotation_z(north_yaw) @ [message.x, -message.y, 0.0]
-        message.x, message.y, message.q = float(x_north), float(-y_west), [math.nan] * 4
+        R = rotation_z(math.radians(turned_deg))
+        x, y, _ = R @ [message.x, -message.y, 0.0]
+        message.x, message.y = float(x), float(-y)
+        turned = wxyz_from_R_odom_drone(R @ R_odom_drone_from_wxyz(message.q))
+        message.q = turned if has_yaw else [math.nan] * 4
 
     host.edit = change
     now_ns = START_NS + host.ticks * 10_000_000
-    outcome.on_sent(Record("/autopilot/tx", now_ns, now_ns, bytes(host.pose(now_ns).pack(host._mav))))
+    frame = Record("/autopilot/tx", now_ns, now_ns, bytes(host.pose(now_ns).pack(host._mav)))
+    outcome.on_sent(frame, -math.radians(turned_deg))
     result = outcome.result()
-    assert result.sent_worst_m == pytest.approx(0.0, abs=0.2)
-    assert result.sent_yaw_rms_deg is None
+    assert result.sent_worst_m == pytest.approx(error_m, abs=0.5)
+    assert result.sent_yaw_rms_deg == (pytest.approx(0.0, abs=1.0) if has_yaw else None)
 
 
 def test_the_longest_gap_lasts_from_one_pose_to_the_next_or_to_the_end() -> None:

@@ -146,7 +146,8 @@ class AutopilotSession:
             if sent:
                 self.poses.on_sent(pose, now_ns, sent)
                 if any(message.get_type() in POSES for message in sent):
-                    self.switch.on_sent(pose, self.poses.axes_yaw_rad or 0.0, self.poses.autopilot, now_ns)
+                    turn_rad = self.poses.turn_rad(pose)
+                    self.switch.on_sent(pose, self.poses.axes_yaw_rad or 0.0, turn_rad, self.poses.autopilot, now_ns)
             self._send_texts(now_ns)
 
     def sent(self) -> list[Record]:

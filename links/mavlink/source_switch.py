@@ -38,7 +38,6 @@ from typing import Any
 from links.mavlink.commands import ACCEPTED, ACK_TIMEOUT_NS, IN_PROGRESS, TEMPORARILY_REJECTED, command_long, is_answer
 from links.mavlink.poses.agreement import MotionAgreement
 from links.mavlink.poses.autopilot_estimate import AutopilotEstimate
-from links.mavlink.poses.odom_frame import odom_yaw_rad
 from links.mavlink.profiles import EXTERNAL, RequiredParameter, findings
 from links.mavlink.readers import CONSTANT_POSITION, HORIZONTAL_RELATIVE
 from links.mavlink.transport.framing import dialect
@@ -88,7 +87,7 @@ class SourceSwitch:
         self._status: tuple[int, Any] | None = None  # arrival and message
         self._position_ns = 0  # newest LOCAL_POSITION_NED
         self._speed_mps = 0.0  # of it, horizontal
-        self._turn_rad = math.pi  # from the autopilot's axes by its own sources to those of the poses; at first unknown
+        self._turn_rad = math.pi  # of the axes of the poses against those of its own sources; at first unknown
         self._too_fast = False  # set 1 is due, see `_is_slow`
         self._blocked = ""  # why grd's set is not requested any more
         self._pending: tuple[int, int] | None = None  # the set requested, and when
@@ -127,17 +126,26 @@ class SourceSwitch:
         elif is_answer(message, SET_EKF_SOURCE_SET, self._own):
             self._on_result(message.result)
 
-    def on_sent(self, pose: RelativePose, axes_yaw_rad: float, autopilot: AutopilotEstimate, now_ns: int) -> None:
-        """A pose was sent in axes of this yaw in `map`; `autopilot`: its newest estimate."""
+    def on_sent(
+        self,
+        pose: RelativePose,
+        axes_yaw_rad: float,
+        turn_rad: float | None,
+        autopilot: AutopilotEstimate,
+        now_ns: int,
+    ) -> None:
+        """A pose was sent, in axes with this yaw in `map`; `autopilot`: its newest estimate.
+
+        `turn_rad`: angle of those axes against the autopilot's own; None: not known.
+        """
         if self._set is None:
             return
         if self._sending_ns is None or now_ns - self._sent_ns > FALLBACK_AFTER_NS:
             self._sending_ns = now_ns
             self.agreement.restart()
         self._sent, self._sent_ns, self._too_fast = pose, now_ns, False
-        if self.active == FIRST_SET:
-            own_yaw_rad = odom_yaw_rad(pose, autopilot)
-            self._turn_rad = self._turn_rad if own_yaw_rad is None else axes_yaw_rad - own_yaw_rad
+        if self.active == FIRST_SET and turn_rad is not None:
+            self._turn_rad = turn_rad
         off_m = self.agreement.add(pose, axes_yaw_rad, autopilot)
         if off_m is not None and self.active != self._set:
             self._warn(f"pose and autopilot differ by {off_m:.1f} m")

@@ -4,8 +4,8 @@
 
     none      a position in the autopilot's own axes; its yaw comes from its compass. It needs no rotation of the drone
     measured  a pose with yaw, while cameras or the raw IMU measure it; its yaw comes from grd alone. The axes are parallel
-              to the autopilot's own when the first pose since its boot is sent, and are then kept (`pose_messages.py`);
-              if it has not reported them, they are those of `map`
+              to the autopilot's own when the first pose since its boot is sent, by its motion if that shows them within
+              the limit, else by its attitude; without an attitude they are those of `map`. Then they are kept
 
 The reset counter is incremented with every jump of the pose, every change of the drone, and after every pause that the
 autopilot noticed, so that it resets to the new pose instead of gating it. Its initial value is arbitrary: after a
@@ -98,6 +98,11 @@ class PoseSender:
         """Whether poses are being sent."""
         return self._sending
 
+    def turn_rad(self, pose: RelativePose) -> float | None:
+        """Angle of the axes of a sent pose against the autopilot's own [rad]; None: not known."""
+        own_yaw_rad = self._odom_axes_yaw_rad(pose)
+        return None if own_yaw_rad is None else (self.axes_yaw_rad or 0.0) - own_yaw_rad
+
     def messages(self, pose: RelativePose, now_ns: int, link_reason: RejectReason | None = None) -> list[Any]:
         """Messages of one pose; none if the gate rejects it, or with a `link_reason`. Then call `on_sent`."""
         self.texts.on_state(pose.state, pose.reason, now_ns)
@@ -169,11 +174,16 @@ class PoseSender:
             self._incremented = True
 
     def _update_axes(self, pose: RelativePose) -> None:
-        if self.sends_yaw and self.axes_yaw_rad is not None:
-            return
-        if pose.odom_yaw_rad is not None and pose.odom_yaw_rad == self._other_boot_rad:
+        if not self.sends_yaw or self.axes_yaw_rad is None:
+            self.axes_yaw_rad = self._odom_axes_yaw_rad(pose) or 0.0
+
+    def _odom_axes_yaw_rad(self, pose: RelativePose) -> float | None:
+        """Yaw of the autopilot's own axes in `map`: by its motion if that is sharp, else by its attitude."""
+        sigma_rad = math.inf if pose.odom_yaw_sigma_rad is None else pose.odom_yaw_sigma_rad
+        uncertain = math.degrees(sigma_rad) > self._limits.odom_yaw_sigma_deg
+        if uncertain or pose.odom_yaw_rad == self._other_boot_rad:
             pose = replace(pose, odom_yaw_rad=None)
-        self.axes_yaw_rad = odom_yaw_rad(pose, self.autopilot) or 0.0
+        return odom_yaw_rad(pose, self.autopilot)
 
     def _reason(self, kind: PoseMessage, pose: RelativePose, now_ns: int) -> RejectReason | None:
         if kind == "landing_target":

@@ -89,10 +89,10 @@ class Flight:
             measured_ns = self.now_ns if self.measured else self.now_ns - 2_000 * MS
             pose = dataclasses.replace(pose, odom_yaw_rad=None, measured_ns=measured_ns)
             self.autopilot.attitude = AutopilotAttitude(0.0, 0.0, self.compass_rad, self.now_ns)
-            if self.axes_yaw_rad is None:
-                self.axes_yaw_rad = odom_yaw_rad(pose, self.autopilot)
-                assert self.axes_yaw_rad is not None
-            self.switch.on_sent(pose, self.axes_yaw_rad, self.autopilot, self.now_ns)
+            own_yaw_rad = odom_yaw_rad(pose, self.autopilot)
+            assert own_yaw_rad is not None
+            axes_yaw_rad = self.axes_yaw_rad = own_yaw_rad if self.axes_yaw_rad is None else self.axes_yaw_rad
+            self.switch.on_sent(pose, axes_yaw_rad, axes_yaw_rad - own_yaw_rad, self.autopilot, self.now_ns)
 
     def _answer(self, request: Any) -> None:
         if request.get_type() == "PARAM_REQUEST_READ":

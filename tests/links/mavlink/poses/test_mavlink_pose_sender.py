@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
 from typing import Any
 
 import pytest
 
+from links.mavlink.poses.autopilot_estimate import AutopilotAttitude
 from links.mavlink.poses.gate import PoseLimits, RejectReason
 from links.mavlink.poses.pose_sender import PoseSender
 from links.mavlink.poses.status_texts import TEXT_BYTES, fitted
@@ -23,6 +25,7 @@ class Output:
         self.pose_sender = PoseSender(("odometry",), PoseLimits(), yaw="measured", **settings)
         self.now_ns = HOST0
         self.counters: list[int] = []
+        self.sent: list[Any] = []
         self.texts: list[tuple[int, str]] = []
 
     def pose(self, after_ms: int = 20, sent: bool = True, **changes: Any) -> int:
@@ -32,6 +35,7 @@ class Output:
         if messages and sent:
             self.pose_sender.on_sent(pose, self.now_ns, messages)
             self.counters += [m.reset_counter for m in messages]
+            self.sent += messages
         self.collect()
         return len(messages)
 
@@ -49,6 +53,55 @@ def test_the_counter_is_constant_without_gaps_and_jumps():
     for _ in range(50):
         output.pose()
     assert set(output.counters) == {250}
+
+
+def yaw_ned_rad(message: Any) -> float:
+    w, x, y, z = message.q
+    return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+
+def test_the_axes_are_the_autopilots_at_the_first_pose_and_stay_those():
+    """The drone's yaw in map is 0; the autopilot reports 60 deg to the right of its north."""
+    output = Output()
+    autopilot = output.pose_sender.autopilot
+    autopilot.attitude = AutopilotAttitude(0.0, 0.0, math.radians(60.0), HOST0)
+    output.pose(odom_yaw_rad=None)
+    autopilot.attitude = AutopilotAttitude(0.0, 0.0, math.radians(100.0), HOST0)  # its EKF has reset its yaw
+    output.pose(odom_yaw_rad=None)
+    for message in output.sent:
+        assert yaw_ned_rad(message) == pytest.approx(math.radians(60.0), abs=1e-6)
+        x, y = message.x, message.y
+        c, s = math.cos(math.radians(60.0)), math.sin(math.radians(60.0))
+        assert (c * x + s * y, -s * x + c * y) == pytest.approx((101.0, -2.0), abs=1e-5)
+    output.pose_sender.on_boot()
+    output.pose(odom_yaw_rad=None)
+    assert yaw_ned_rad(output.sent[-1]) == pytest.approx(math.radians(100.0), abs=1e-6)
+
+
+def test_a_learnt_yaw_of_the_autopilots_axes_counts_more_than_its_compass_if_it_is_sharp():
+    output = Output()
+    output.pose_sender.autopilot.attitude = AutopilotAttitude(0.0, 0.0, math.radians(60.0), HOST0)
+    output.pose(odom_yaw_rad=math.radians(25.0), odom_yaw_sigma_rad=math.radians(8.0))
+    assert yaw_ned_rad(output.sent[-1]) == pytest.approx(math.radians(60.0), abs=1e-6)
+    output = Output()
+    output.pose_sender.autopilot.attitude = AutopilotAttitude(0.0, 0.0, math.radians(60.0), HOST0)
+    output.pose(odom_yaw_rad=math.radians(25.0))
+    assert yaw_ned_rad(output.sent[-1]) == pytest.approx(math.radians(25.0), abs=1e-6)
+    output.pose_sender.on_boot()  # its axes are others; the learnt yaw is of the boot before
+    output.pose_sender.autopilot.attitude = AutopilotAttitude(0.0, 0.0, math.radians(60.0), output.now_ns)
+    output.pose(odom_yaw_rad=math.radians(25.0))
+    assert yaw_ned_rad(output.sent[-1]) == pytest.approx(math.radians(60.0), abs=1e-6)
+
+
+@pytest.mark.parametrize("age_s", [None, 5.0])
+def test_without_a_recent_attitude_the_axes_are_those_of_map(age_s: float | None):
+    output = Output()
+    if age_s is not None:
+        attitude = AutopilotAttitude(0.0, 0.0, math.radians(60.0), HOST0 - round(1e9 * age_s))
+        output.pose_sender.autopilot.attitude = attitude
+    output.pose(odom_yaw_rad=None)
+    assert (output.sent[0].x, output.sent[0].y) == (101.0, -2.0)
+    assert yaw_ned_rad(output.sent[0]) == pytest.approx(0.0, abs=1e-6)
 
 
 @pytest.mark.parametrize("jump", [{"resets": 1}, {"resets": 256}, {"track_id": 2}])

@@ -17,7 +17,7 @@ from links.cli.console import out, show_table, warn
 from links.clock import Clock
 from links.runs.fused_poses import FusedPoses, rms
 from links.runs.request import RunResult
-from links.runs.results import FIX_FILE, POSE_FILE, SUMMARY_FILE, stamp_s
+from links.runs.results import FIX_FILE, POSE_FILE, SUMMARY_FILE, Results, stamp_s
 from links.zenoh import Receiver, Sender
 from stages.messages import PoseState
 
@@ -89,6 +89,7 @@ def truth_texts(run: RunResult) -> list[str]:
     if run.results.pose_states:
         states = ", ".join(f"{count} {state}" for state, count in run.results.pose_states.items())
         texts.append(f"fused poses: {states}; {run.results.resets} jumps; {_first_full(run)}")
+        texts.append(_gate(run.results))
     if run.poses is not None and run.poses.has_truth:
         x, y, z = run.poses.rmse_xyz_m
         distance_m = run.poses.distance_m
@@ -102,6 +103,14 @@ def truth_texts(run: RunResult) -> list[str]:
             text += f"; rotation RMSE {rms(angle_deg):.2f} deg, largest {np.nanmax(angle_deg):.2f} deg"
         texts.append(text)
     return texts
+
+
+def _gate(results: Results) -> str:
+    """How many poses the autopilot's gate accepts, and why it rejects the others."""
+    total, rejected = sum(results.pose_states.values()), results.gate_rejections
+    reasons = ", ".join(f"{count} {reason}" for reason, count in rejected.items())
+    text = f"autopilot's gate (yaw: {results.settings.yaw}): accepts {total - sum(rejected.values())} of {total} poses"
+    return f"{text}; rejects {reasons}" if reasons else text
 
 
 def _first_full(run: RunResult) -> str:

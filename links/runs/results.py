@@ -130,6 +130,7 @@ class Results(Tap[ResultsSettings]):
         self._pose_state: PoseState | None = None
         self._pose_states: Counter[str] = Counter()
         self._pose_reason: str = ""
+        self._rejected: Counter[str] = Counter()  # poses, by the gate's reason
         self._trusted: dict[str, bool] = {}  # cues, by source
         self._fused: dict[str, bool] = {}  # cues in the fusion: whether used, by source
         self._resets: int = 0
@@ -159,6 +160,11 @@ class Results(Tap[ResultsSettings]):
     def pose_states(self) -> dict[str, int]:
         """Number of poses in each state, most frequent first; empty without a fuse stage."""
         return dict(self._pose_states.most_common())
+
+    @property
+    def gate_rejections(self) -> dict[str, int]:
+        """Number of poses that the autopilot's gate rejects at their own time, by reason, most frequent first."""
+        return dict(self._rejected.most_common())
 
     @property
     def pose_reason(self) -> str:
@@ -294,6 +300,9 @@ class Results(Tap[ResultsSettings]):
         whether the autopilot's gate accepts the pose at its own time.
         """
         self._pose_states[message.state.name] += 1
+        rejected = gate_reason(message, message.stamp_ns, self.settings.limits, self.settings.yaw)
+        if rejected is not None:
+            self._rejected[rejected.value] += 1
         self._resets, self._pose_reason = message.resets, message.reason
         if message.state is not self._pose_state:
             self._pose_state = message.state
@@ -313,10 +322,9 @@ class Results(Tap[ResultsSettings]):
         upper = _covariance(estimate)[UPPER_6]
         measured = "" if message.measured_ns is None else stamp_s(message.measured_ns)
         nis = "" if math.isnan(message.nis) else f"{message.nis:.4g}"
-        accepted = gate_reason(message, message.stamp_ns, self.settings.limits, self.settings.yaw) is None
         values = [
             message.state.name,
-            int(accepted),
+            int(rejected is None),
             int(R is not None),
             message.resets,
             nis,

@@ -44,7 +44,11 @@ def summary(run: RunResult, request: RunRequest) -> dict[str, Any]:
             for result, count, example in results.search_results
         ],
         "fixes": len(results.fixes),
-        "poses": {"states": results.pose_states, "resets": results.resets},
+        "poses": {
+            "states": results.pose_states,
+            "resets": results.resets,
+            "gate": {"yaw": results.settings.yaw, "rejected": results.gate_rejections},
+        },
         "states": [
             {"stamp_s": stamp_s(t.stamp_ns), "track_id": t.track_id, "state": t.state, "reason": t.reason}
             for t in results.transitions

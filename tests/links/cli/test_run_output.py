@@ -18,7 +18,10 @@ S = 1_000_000_000
 
 
 def run(states: dict[str, int], errors: Any = None, poses: Any = None) -> RunResult:
-    results = SimpleNamespace(pose_states=states, pose_reason="no track", resets=0, fixes=[])
+    settings, rejections = SimpleNamespace(yaw="none"), {"yaw of autopilot's axes unknown": 3, "no position": 1}
+    results = SimpleNamespace(
+        pose_states=states, pose_reason="no track", resets=0, fixes=[], settings=settings, gate_rejections=rejections
+    )
     report = SimpleNamespace(first_ns=S, last_ns=11 * S)
     return RunResult(Path("a.mcap"), Path("out"), cast(Any, report), cast(Any, results), errors, poses, None, 1.0, [])
 
@@ -32,6 +35,12 @@ def fused(state: str) -> Any:
 def rows(runs: list[tuple[str, RunResult]]) -> dict[str, list[str]]:
     first, *columns = (list(column.cells) for column in side_by_side(runs).columns)
     return {str(name): [str(column[k]) for column in columns] for k, name in enumerate(first)}
+
+
+def test_what_the_gate_accepts_and_why_it_rejects_the_rest_is_one_line():
+    assert truth_texts(run({"FULL": 8, "LOST": 1}))[1] == (
+        "autopilot's gate (yaw: none): accepts 5 of 9 poses; rejects 3 yaw of autopilot's axes unknown, 1 no position"
+    )
 
 
 @pytest.mark.parametrize("truth_first", [True, False])

@@ -77,6 +77,16 @@ def test_a_pose_without_rotation_is_marked_and_its_variance_is_no_infinity(run):
     assert (folder / POSE_FILE).read_text().splitlines()[1].endswith(" 0 0 0 1")
 
 
+def test_poses_that_the_gate_rejects_are_counted_by_reason(tmp_path):
+    results = Results(yaw="measured")
+    results.open(Run(tmp_path, "made", "", ""))
+    messages = [lost(S, status(PoseState.LOST)), *[made(t, state=POSITION_ONLY) for t in (1.02, 1.04)], made(1.06, rotation_z(0.5))]
+    for message in messages:
+        results.see("fuse.relative_pose", message, message.stamp_ns)
+    results.close()
+    assert results.gate_rejections == {"rotation unknown": 2, "no position": 1}
+
+
 def test_a_pose_is_good_when_the_autopilot_gate_accepts_it(tmp_path):
     R, wide, askew = rotation_z(0.5), (0.001,) * 3 + (0.01, 0.01, 0.16), (0.001, 0.001, 0.01, 0.01, 0.01, 0.01)
     for limits, expected in (

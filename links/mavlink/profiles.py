@@ -3,8 +3,8 @@
 They depend on what the poses contain (`yaw` of the link):
 
     none      positions in the autopilot's own axes: its yaw must come from its compass (or GPS), never from grd
-    measured  poses in axes that are constant, parallel to the autopilot's when the first was sent: the yaw must come from
-              grd alone; with the compass it would turn against the positions as the error of the compass changes
+    measured  poses in axes that are constant, parallel to the autopilot's when the first was sent: the yaw must come
+              from grd alone; with the compass it would turn against the positions as the error of the compass changes
 
 grd is one source set of ArduPilot (`source_set`, EK3_SRC2_* by default); set 1 is the source that flies without grd.
 

@@ -18,8 +18,8 @@ from another source than grd. ArduPilot alone does not return to it. Without a c
 nothing is requested: the pilot has to switch. Neither does grd that was restarted in flight request set 1 before it has
 requested its own set again, because it does not know which set is in use.
 
-Poses with yaw are in axes parallel to those that the autopilot had at the first one. If its EKF has reset its yaw since,
-they are not parallel any more. With the source of the yaw the EKF turns its axes, but not its velocity:
+Poses with yaw are in axes parallel to those that the autopilot had at the first one. If its EKF has reset its yaw
+since, they are not parallel any more. With the source of the yaw the EKF turns its axes, but not its velocity:
 NavEKF3_core::SelectVelPosFusion resets the position alone, and a velocity that is wrong by less than the gate (5 sigma,
 some 4 m/s) is not reset either but flown with. So no set is requested, set 1 neither, while the velocity in the turned
 axes would be wrong by more than MAX_TURNED_MPS.

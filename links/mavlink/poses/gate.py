@@ -47,7 +47,6 @@ class RejectReason(enum.Enum):
     YAW_NOT_MEASURED = "yaw not measured"
     ODOM_YAW = "yaw of autopilot's axes unknown"
     ODOM_YAW_SIGMA = "yaw of autopilot's axes uncertain"
-    ODOM_YAW_DISTANCE = "too far for positions without yaw"
     ODOM_YAW_RESET = "autopilot reset its yaw"
     REJECTED_BY_AUTOPILOT = "autopilot rejects the position"
     NO_ATTITUDE = "no attitude from autopilot"

@@ -1,7 +1,7 @@
 """MAVLink messages of a pose with rotation: ODOMETRY, VISION_POSITION_ESTIMATE and LANDING_TARGET.
 
-ODOMETRY and VISION_POSITION_ESTIMATE contain the drone's pose with the origin of `map`, which is static while the vehicle
-drives, as an EKF requires, in axes that point as the autopilot's own did when the first pose was sent:
+ODOMETRY and VISION_POSITION_ESTIMATE contain the drone's pose with the origin of `map`, which is static while the
+vehicle drives, as an EKF requires, in axes that point as the autopilot's own did when the first pose was sent:
 
     p_sent = Rz(axes_yaw)^T p_map,   R_sent_drone = Rz(axes_yaw)^T R_map_drone
 

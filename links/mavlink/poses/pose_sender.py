@@ -3,9 +3,9 @@
 `yaw` decides what ODOMETRY and VISION_POSITION_ESTIMATE contain, and which yaw source the autopilot needs:
 
     none      a position in the autopilot's own axes; its yaw comes from its compass. It needs no rotation of the drone
-    measured  a pose with yaw, while cameras or the raw IMU measure it; its yaw comes from grd alone. The axes are parallel
-              to the autopilot's own when the first pose since its boot is sent, by its motion if that shows them within
-              the limit, else by its attitude; without an attitude they are those of `map`. Then they are kept
+    measured  a pose with yaw, while cameras or the raw IMU measure it; its yaw comes from grd alone. The axes are
+              parallel to the autopilot's own when the first pose since its boot is sent, by its motion if that shows
+              them within the limit, else by its attitude; without an attitude they are those of `map`. They are kept
 
 The reset counter is incremented with every jump of the pose, every change of the drone, and after every pause that the
 autopilot noticed, so that it resets to the new pose instead of gating it. Its initial value is arbitrary: after a
@@ -34,7 +34,6 @@ from links.mavlink.poses.position_messages import position_odometry, position_vi
 from links.mavlink.poses.status_texts import StatusTexts
 from links.mavlink.profiles import ProfileName, YawOutput
 from links.mavlink.transport.framing import SEQUENCE
-from stages.geometry.frames import Array64
 from stages.messages import PoseState, RelativePose
 
 PoseMessage = Literal["odometry", "vision_position_estimate", "landing_target"]
@@ -76,7 +75,6 @@ class PoseSender:
         self._poses_sent = self._yaw_reset = False  # since the autopilot's boot
         self._odom_yaw_rad: float | None = None  # of the newest pose that had one
         self._other_boot_rad: float | None = None  # yaw of its axes before its newest boot: not valid any more
-        self._first_map_m: Array64 | None = None  # first position that was sent since the autopilot's boot
         to_ekf: list[PoseMessage] = [kind for kind in self._kinds if kind != "landing_target"]
         self._to_ekf: tuple[PoseMessage, ...] = tuple(to_ekf) or self._kinds
         self._sent: SentPose | None = None  # of `_to_ekf`
@@ -129,7 +127,7 @@ class PoseSender:
     def on_boot(self) -> None:
         """The autopilot has booted: its axes are others, and their yaw has to be learnt again before a pose is sent."""
         self._poses_sent = self._yaw_reset = False
-        self._other_boot_rad, self._first_map_m, self.axes_yaw_rad = self._odom_yaw_rad, None, None
+        self._other_boot_rad, self.axes_yaw_rad = self._odom_yaw_rad, None
         self.fusion.on_boot()
 
     def on_estimator_status(self, message: Any, now_ns: int) -> None:
@@ -148,8 +146,6 @@ class PoseSender:
             return
         self._sent = SentPose(now_ns, pose.stamp_ns, pose.resets, pose.track_id)
         self._incremented, self._poses_sent = False, True
-        if self._first_map_m is None and pose.xyz_map_m is not None:
-            self._first_map_m = pose.xyz_map_m
         if not self._sending:
             self._sending = True
             self.texts.on_sending(now_ns)
@@ -207,15 +203,7 @@ class PoseSender:
             return RejectReason.ODOM_YAW_RESET
         if pose.odom_yaw_rad is None or pose.odom_yaw_sigma_rad is None or pose.odom_yaw_rad == self._other_boot_rad:
             return RejectReason.ODOM_YAW
-        if pose.odom_yaw_sigma_rad * self._moved_m(pose) > self._limits.position_sigma_m:
-            return RejectReason.ODOM_YAW_DISTANCE
         return None
-
-    def _moved_m(self, pose: RelativePose) -> float:
-        """Horizontal distance from the first position that was sent."""
-        if self._first_map_m is None or pose.xyz_map_m is None:
-            return 0.0
-        return math.hypot(*(pose.xyz_map_m - self._first_map_m)[:2])
 
     def _message(self, kind: PoseMessage, pose: RelativePose) -> Any:
         if kind != "landing_target" and self._yaw == "none":
@@ -229,6 +217,6 @@ class PoseSender:
     def _position_message(self, kind: PoseMessage, pose: RelativePose) -> Any:
         attitude = self.autopilot.attitude if self._profile == "ardupilot" else None
         if kind == "odometry":
-            return position_odometry(pose, self.reset_counter, self._limits, attitude, self._moved_m(pose))
+            return position_odometry(pose, self.reset_counter, self._limits, attitude)
         assert attitude is not None  # PX4 has no VISION_POSITION_ESTIMATE
-        return position_vision_estimate(pose, self.reset_counter, attitude, self._moved_m(pose))
+        return position_vision_estimate(pose, self.reset_counter, attitude)

@@ -8,8 +8,8 @@ not measured, and stays the same:
 
 An error of that yaw, e, turns every acceleration against the one that the autopilot measures. Its EKF forgets over
 about a second, so its position is off by about e times the way that the drone is accelerated in that time (LEVER_M).
-This and the variation of its compass are added to the covariance, and e times the distance from the first position
-that was sent, where the autopilot's frame and ours agree by its reset.
+This and the variation of its compass are added to the covariance. The distance from the origin does not matter: the
+axes are constant, and the autopilot takes its position from them alone. They are turned against the true north by e.
 
 Source: ours; ArduPilot NavEKF3 and PX4 EKF2 with position noise of 0.2 m and accelerometer noise of 0.35 m/s^2.
 """
@@ -74,15 +74,12 @@ def gate_reason(pose: RelativePose, now_ns: int, limits: PoseLimits, yaw: YawOut
     return reject_reason(pose, now_ns, limits) or yaw_reason(pose, limits)
 
 
-def odom_position(pose: RelativePose, moved_m: float = 0.0) -> OdomPosition:
-    """The position in the autopilot's axes. Raises ValueError for a pose that the gate must reject.
-
-    `moved_m`: horizontal distance from the first position that was sent.
-    """
+def odom_position(pose: RelativePose) -> OdomPosition:
+    """The position in the autopilot's axes. Raises ValueError for a pose that the gate must reject."""
     if pose.estimate is None or pose.odom_yaw_rad is None or pose.odom_yaw_sigma_rad is None:
         raise ValueError("no position in the autopilot's axes: the gate must reject it")
     R_odom_map = rotation_z(-pose.odom_yaw_rad)
-    level_m2 = (pose.odom_yaw_sigma_rad**2 + COMPASS_RAD**2) * LEVER_M**2 + (pose.odom_yaw_sigma_rad * moved_m) ** 2
+    level_m2 = (pose.odom_yaw_sigma_rad**2 + COMPASS_RAD**2) * LEVER_M**2
     covariance = R_odom_map @ _covariance_map_m2(pose) @ R_odom_map.T + np.diag([level_m2, level_m2, 0.0])
     return OdomPosition(R_odom_map @ pose.estimate.xyz_map_m, covariance, R_odom_map)
 

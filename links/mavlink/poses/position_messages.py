@@ -32,10 +32,10 @@ NO_YAW_RAD2 = math.pi**2  # of a yaw that is not measured
 
 
 def position_odometry(
-    pose: RelativePose, reset_counter: int, limits: PoseLimits, attitude: AutopilotAttitude | None, moved_m: float = 0.0
+    pose: RelativePose, reset_counter: int, limits: PoseLimits, attitude: AutopilotAttitude | None
 ) -> Any:
-    """ODOMETRY of a position that the gate has accepted. `attitude` None: for PX4. `moved_m`: see `odom_position`."""
-    position = odom_position(pose, moved_m)
+    """ODOMETRY of a position that the gate has accepted. `attitude` None: for PX4."""
+    position = odom_position(pose)
     return dialect().MAVLink_odometry_message(
         pose.stamp_ns // 1000,
         LOCAL_NED if attitude is None else LOCAL_FRD,
@@ -52,11 +52,9 @@ def position_odometry(
     )
 
 
-def position_vision_estimate(
-    pose: RelativePose, reset_counter: int, attitude: AutopilotAttitude, moved_m: float = 0.0
-) -> Any:
-    """VISION_POSITION_ESTIMATE of an accepted position, for ArduPilot. `moved_m`: see `odom_position`."""
-    position = odom_position(pose, moved_m)
+def position_vision_estimate(pose: RelativePose, reset_counter: int, attitude: AutopilotAttitude) -> Any:
+    """VISION_POSITION_ESTIMATE of an accepted position, for ArduPilot."""
+    position = odom_position(pose)
     return dialect().MAVLink_vision_position_estimate_message(
         pose.stamp_ns // 1000,
         *flip_yz(position.xyz_odom_m),

@@ -400,5 +400,11 @@ def test_a_flight_that_follows_the_vehicle_at_speed_is_switched_to_gps_when_the_
     square = {"do": "square", "for_s": 11, "side_m": 8.0}
     plan = [{"do": "path", "for_s": 20}, square, {"do": "follow", "for_s": 20}]
     stack = flown(config, "follow_fixes", {"plan": plan, "source_sets": ["gps", "external_no_velocity"]}, (34.0, 40.0))
-    assert [str(event) for event in stack.events] == ["plan: path", "plan: square", "source set 2", "plan: follow", "source set 1"]
+    assert [str(event) for event in stack.events] == [
+        "plan: path",
+        "plan: square",
+        "source set 2",
+        "plan: follow",
+        "source set 1",
+    ]
     assert not stack.quadrotor.crashed

@@ -80,7 +80,11 @@ def test_a_pose_without_rotation_is_marked_and_its_variance_is_no_infinity(run):
 def test_poses_that_the_gate_rejects_are_counted_by_reason(tmp_path):
     results = Results(yaw="measured")
     results.open(Run(tmp_path, "made", "", ""))
-    messages = [lost(S, status(PoseState.LOST)), *[made(t, state=POSITION_ONLY) for t in (1.02, 1.04)], made(1.06, rotation_z(0.5))]
+    messages = [
+        lost(S, status(PoseState.LOST)),
+        *[made(t, state=POSITION_ONLY) for t in (1.02, 1.04)],
+        made(1.06, rotation_z(0.5)),
+    ]
     for message in messages:
         results.see("fuse.relative_pose", message, message.stamp_ns)
     results.close()

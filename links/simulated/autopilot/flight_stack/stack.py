@@ -85,7 +85,7 @@ class FlightStack:
         position, _, _, yaw = (part[0] for part in path.at(np.zeros(1)))
         home = np.array([position[0], position[1], ground_m + 0.2]) if s.on_ground else position
         self._home, self._world_yaw = home, -math.radians(settings.heading_of_world_x_deg)
-        self._map = tuple(part[0] for part in (vehicle.at(np.zeros(1))[0], vehicle.at(np.zeros(1))[3]))
+        self._map_m = vehicle.at(np.zeros(1))[0][0]  # origin of external positions
         self.quadrotor = Quadrotor(s, home, float(yaw), ground_m, duration_s, seed)
         self.motion = self.quadrotor.motion
         self._sensors, self._tick = Sensors(s, seed), 0
@@ -238,19 +238,14 @@ class FlightStack:
         return self._controller.command(target, estimate[0:3], estimate[3:6])
 
     @property
-    def north_yaw_of_map(self) -> float:
-        """Yaw [rad] that turns coordinates of `map` into axes that point to the true north (x north, y west)."""
-        return self._world_yaw + float(self._map[1])
-
-    @property
     def external_sets(self) -> list[bool]:
         """Whether the position of each source set is external."""
         return [SOURCE_SETS[name].position is AidingSource.EXTERNAL for name in self.settings.source_sets]
 
     def _frame(self) -> SurveyFrame:
-        """Where the sources in use put the world: all are in axes that point north, as far as the autopilot knows it."""
+        """Where the sources in use put the world: all are in axes that point north."""
         sources = self.ekf.sources
-        origin = self._map[0] if sources.position is AidingSource.EXTERNAL else self._home
+        origin = self._map_m if sources.position is AidingSource.EXTERNAL else self._home
         xyz = -rotate(origin, self._world_yaw)
         if sources.height is not AidingSource.EXTERNAL:
             xyz[2] = -self._home[2]

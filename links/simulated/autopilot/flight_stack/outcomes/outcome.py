@@ -82,10 +82,10 @@ class FlightOutcome:
         self._stack, self._world, self._truth = stack, world, truth
         self._lost_s: float | None = None
         self._last: Array64 | None = None
-        self._poses = SentPoses(truth, odometry, stack.north_yaw_of_map)
+        self._poses = SentPoses(truth, odometry)
 
     def on_sent(self, record: Record, axes_yaw_rad: float) -> None:
-        """A frame to the autopilot, whose axes have this yaw in `map` if it is a pose with yaw.
+        """A frame to the autopilot, whose axes have this yaw in `map` if it is a pose.
 
         After a crash none counts: the simulated IMU does not feel the impact.
         """

@@ -1,9 +1,8 @@
 """Errors of the poses that were sent to the autopilot, and whether the covariances in the messages hold.
 
 Errors of a sent pose are those of ODOMETRY against T_map_vehicle T_vehicle_drone at its time: the first by the
-vehicle's odometry, whose drift the autopilot's frame shares, the second true. Without odometry both are true. Poses with
-yaw are compared in the axes that grd states for them. A position that is sent without yaw is compared in axes that
-point to the true north. For statistics only.
+vehicle's odometry, whose drift the autopilot's frame shares, the second true. Without odometry both are true. They are
+compared in the axes that grd states for what it sends. For statistics only.
 
 Source: ours; 95 % quantiles of chi-squared with 3 and 1 degrees of freedom.
 """
@@ -55,16 +54,15 @@ class _SentPose:
 class SentPoses:
     """Call `add` for each frame to the autopilot."""
 
-    def __init__(self, truth: Truth, odometry: VehicleOdometry | None, north_yaw_of_map: float) -> None:
-        """north_yaw_of_map: turns coordinates of map into axes that point to the true north [rad]."""
-        self._truth, self._odometry, self._north_yaw = truth, odometry, north_yaw_of_map
+    def __init__(self, truth: Truth, odometry: VehicleOdometry | None) -> None:
+        self._truth, self._odometry = truth, odometry
         self._poses: list[_SentPose] = []
 
     def __len__(self) -> int:
         return len(self._poses)
 
     def add(self, record: Record, axes_yaw_rad: float) -> None:
-        """A frame to the autopilot. axes_yaw_rad: yaw in map of the axes of a pose with yaw."""
+        """A frame to the autopilot. axes_yaw_rad: yaw in map of the axes of a pose."""
         message: Any = parse_frame(record.data)
         if message.get_type() != "ODOMETRY":
             return
@@ -81,7 +79,7 @@ class SentPoses:
                 sent_ns=record.arrival_ns,
                 xyz_m=flip_yz(np.array([message.x, message.y, message.z])),
                 yaw_rad=math.atan2(R[1, 0], R[0, 0]),
-                axes_yaw_rad=axes_yaw_rad if has_yaw else -self._north_yaw,
+                axes_yaw_rad=axes_yaw_rad,
                 covariance_m2=position,
                 yaw_variance=float(upper[YAW_VARIANCE]),
             )

@@ -17,9 +17,6 @@ from stages.geometry.frames import rotation_z
 from tests.links.simulated.autopilot.flight_stack.sent_truth import PARKED, START_NS, Host
 
 
-NORTH = 30.0  # yaw of map in axes that point north [deg]
-
-
 def watched(host: Host, world: RayScene | None = None, odometry: VehicleOdometry | None = None) -> FlightOutcome:
     scene = world or RayScene(box((-500, -500, -500), (-499, -499, -499), "metal"))
     return FlightOutcome(host.stack, scene, Truth(START_NS, PARKED, host.stack.motion), odometry)
@@ -78,18 +75,16 @@ def test_the_share_inside_is_that_of_the_covariance_in_the_message(
     assert (result.inside_share, result.yaw_inside_share) == inside
 
 
-@pytest.mark.parametrize(("has_yaw", "turned_deg", "error_m"), [(True, 30.0, 0.0), (False, NORTH, 0.0), (False, 0.0, 3.6)])
-def test_a_pose_is_compared_in_the_axes_that_grd_states_a_position_in_axes_that_point_north(
-    has_yaw: bool, turned_deg: float, error_m: float
-) -> None:
+@pytest.mark.parametrize("has_yaw", [True, False])
+@pytest.mark.parametrize(("stated_deg", "error_m"), [(30.0, 0.0), (0.0, 3.4)])
+def test_a_pose_is_compared_in_the_axes_that_grd_states(has_yaw: bool, stated_deg: float, error_m: float) -> None:
     """The drone is 6 to 7 m from the origin: 30 deg move it by 3.1 to 3.6 m."""
-    host = Host(3.0, autopilot={"heading_of_world_x_deg": -NORTH})
+    host = Host(3.0)
     outcome = watched(host)
     host.run(2.0)
-    assert math.degrees(host.stack.north_yaw_of_map) == pytest.approx(NORTH)
 
     def change(message, time_s: float) -> None:
-        R = rotation_z(math.radians(turned_deg))
+        R = rotation_z(math.radians(-30.0))
         x, y, _ = R @ [message.x, -message.y, 0.0]
         message.x, message.y = float(x), float(-y)
         turned = wxyz_from_R_odom_drone(R @ R_odom_drone_from_wxyz(message.q))
@@ -98,10 +93,10 @@ def test_a_pose_is_compared_in_the_axes_that_grd_states_a_position_in_axes_that_
     host.edit = change
     now_ns = START_NS + host.ticks * 10_000_000
     frame = Record("/autopilot/tx", now_ns, now_ns, bytes(host.pose(now_ns).pack(host._mav)))
-    outcome.on_sent(frame, -math.radians(turned_deg))
+    outcome.on_sent(frame, math.radians(stated_deg))
     result = outcome.result()
-    assert result.sent_worst_m == pytest.approx(error_m, abs=0.5)
-    assert result.sent_yaw_rms_deg == (pytest.approx(0.0, abs=1.0) if has_yaw else None)
+    assert result.sent_worst_m == pytest.approx(error_m, abs=0.4)
+    assert result.sent_yaw_rms_deg == (pytest.approx(30.0 - stated_deg, abs=1.0) if has_yaw else None)
 
 
 def test_the_longest_gap_lasts_from_one_pose_to_the_next_or_to_the_end() -> None:

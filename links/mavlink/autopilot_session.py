@@ -22,6 +22,7 @@ PX4 src/modules/mavlink/mavlink_timesync.cpp.
 from __future__ import annotations
 
 import dataclasses
+import math
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -173,6 +174,8 @@ class AutopilotSession:
                 counts["source sets requested"] = self.switch.requests
             if self.switch.agreement.disagreements:
                 counts["pose and autopilot differ"] = self.switch.agreement.disagreements
+            if self.poses.axes_yaw_rad is not None:
+                counts["yaw in map of the sent axes [deg]"] = round(math.degrees(self.poses.axes_yaw_rad))
             round_trip_ns = self._timesync.newest_ns
             intervals = self.intervals.counters
         totals = {

@@ -125,9 +125,9 @@ class ClosedLoop:
         return (first_ns[True] - min(first_ns.values())) * 1e-9 if True in first_ns else None
 
     @property
-    def axes_yaw_rad(self) -> float:
-        """Yaw in `map` of the axes that poses are sent in [rad]."""
-        return 0.0 if self._poses is None else self._poses.axes_yaw_rad
+    def axes_yaw_rad(self) -> float | None:
+        """Yaw in `map` of the axes that poses are sent in [rad]; None: none was sent."""
+        return None if self._poses is None else self._poses.axes_yaw_rad
 
     def sent(self) -> list[Record]:
         """Frames to the autopilot since the last call, stamped with the time at which they leave the host."""

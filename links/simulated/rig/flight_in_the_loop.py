@@ -65,12 +65,14 @@ class FlightInTheLoop:
         if self._loop is None:
             return []
         frames = self._loop.sent()
+        if self._loop.axes_yaw_rad is not None:
+            self.stack.axes_yaw_rad = self._loop.axes_yaw_rad
         for frame in frames:
             if frame.stamp_ns != frame.arrival_ns:
                 continue  # of an earlier run: recorded again, not sent
             self.stack.receive(frame.data, frame.arrival_ns)
             if self._outcome is not None:
-                self._outcome.on_sent(frame, self._loop.axes_yaw_rad)
+                self._outcome.on_sent(frame, self._loop.axes_yaw_rad or 0.0)
         return frames
 
     def result(self) -> Outcome | None:

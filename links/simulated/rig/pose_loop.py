@@ -111,9 +111,9 @@ class PoseLoop:
         return next(self._session.receive(record.data, PEER, record.arrival_ns), None)
 
     @property
-    def axes_yaw_rad(self) -> float:
-        """Yaw in `map` of the axes that poses are sent in [rad]."""
-        return self._session.poses.axes_yaw_rad or 0.0 if self._next_tick_ns is not None else 0.0
+    def axes_yaw_rad(self) -> float | None:
+        """Yaw in `map` of the axes that poses are sent in [rad]; None: none was sent."""
+        return self._session.poses.axes_yaw_rad if self._next_tick_ns is not None else None
 
     def sent(self) -> list[Record]:
         """Records of what was sent since the last call."""

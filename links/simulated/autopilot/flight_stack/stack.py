@@ -85,7 +85,9 @@ class FlightStack:
         position, _, _, yaw = (part[0] for part in path.at(np.zeros(1)))
         home = np.array([position[0], position[1], ground_m + 0.2]) if s.on_ground else position
         self._home, self._world_yaw = home, -math.radians(settings.heading_of_world_x_deg)
-        self._map_m = vehicle.at(np.zeros(1))[0][0]  # origin of external positions
+        self._map = vehicle.at(np.zeros(1))[0][0], float(vehicle.at(np.zeros(1))[3][0])  # position and yaw of map
+        self.axes_yaw_rad: float | None = None
+        """Yaw in `map` of the axes of external positions, as grd states it; None: not known, they point north."""
         self.quadrotor = Quadrotor(s, home, float(yaw), ground_m, duration_s, seed)
         self.motion = self.quadrotor.motion
         self._sensors, self._tick = Sensors(s, seed), 0
@@ -243,13 +245,14 @@ class FlightStack:
         return [SOURCE_SETS[name].position is AidingSource.EXTERNAL for name in self.settings.source_sets]
 
     def _frame(self) -> SurveyFrame:
-        """Where the sources in use put the world: all are in axes that point north."""
-        sources = self.ekf.sources
-        origin = self._map_m if sources.position is AidingSource.EXTERNAL else self._home
-        xyz = -rotate(origin, self._world_yaw)
+        """Where the sources in use put the world: GPS in axes that point north, external ones in those of grd."""
+        sources, (map_m, map_yaw) = self.ekf.sources, self._map
+        external = sources.position is AidingSource.EXTERNAL
+        yaw = -map_yaw - self.axes_yaw_rad if external and self.axes_yaw_rad is not None else self._world_yaw
+        xyz = -rotate(map_m if external else self._home, yaw)
         if sources.height is not AidingSource.EXTERNAL:
             xyz[2] = -self._home[2]
-        return SurveyFrame(self._world_yaw, xyz)
+        return SurveyFrame(yaw, xyz)
 
     def _do_plan(self, time_s: float) -> None:
         while self._plan and time_s >= self._step_ends_s - 1e-9:

@@ -48,6 +48,7 @@ class RejectReason(enum.Enum):
     ODOM_YAW = "yaw of autopilot's axes unknown"
     ODOM_YAW_SIGMA = "yaw of autopilot's axes uncertain"
     ODOM_YAW_RESET = "autopilot reset its yaw"
+    COMPASS = "autopilot's compass is wrong"
     REJECTED_BY_AUTOPILOT = "autopilot rejects the position"
     NO_ATTITUDE = "no attitude from autopilot"
 

@@ -38,6 +38,7 @@ from stages.messages import PoseState, RelativePose
 
 PoseMessage = Literal["odometry", "vision_position_estimate", "landing_target"]
 
+MAX_COMPASS_RAD = math.radians(20.0)  # ours, chosen: 30 deg let the position loop of the simulated autopilot oscillate
 POSE_TIMEOUT_NS = 300_000_000  # the autopilot's timeout for poses
 
 
@@ -195,7 +196,11 @@ class PoseSender:
         return reason
 
     def _axes_reason(self, pose: RelativePose, now_ns: int) -> RejectReason | None:
-        """Why the autopilot's axes are not those that were learnt. The first ATTITUDE after a silence shows a boot."""
+        """Why the autopilot cannot use a position in the axes that were learnt.
+
+        The first ATTITUDE after a silence shows a boot. While the body's yaw is measured, its difference from the
+        autopilot's shows the error of its compass.
+        """
         attitude = self.autopilot.attitude
         if attitude is None or now_ns - attitude.arrival_ns > MAX_ATTITUDE_AGE_NS:
             return RejectReason.NO_ATTITUDE
@@ -203,6 +208,10 @@ class PoseSender:
             return RejectReason.ODOM_YAW_RESET
         if pose.odom_yaw_rad is None or pose.odom_yaw_sigma_rad is None or pose.odom_yaw_rad == self._other_boot_rad:
             return RejectReason.ODOM_YAW
+        by_compass_rad = odom_yaw_rad(replace(pose, odom_yaw_rad=None), self.autopilot)
+        if by_compass_rad is not None:
+            off_rad = math.remainder(by_compass_rad - pose.odom_yaw_rad, math.tau)
+            return RejectReason.COMPASS if abs(off_rad) > MAX_COMPASS_RAD else None
         return None
 
     def _message(self, kind: PoseMessage, pose: RelativePose) -> Any:

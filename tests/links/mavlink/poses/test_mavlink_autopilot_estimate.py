@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import Any
 
@@ -15,7 +16,7 @@ from links.mavlink.poses.gate import PoseLimits, RejectReason
 from links.mavlink.poses.pose_sender import PoseSender
 from links.mavlink.transport.framing import packed
 from links.simulated.rig.pose_loop import PEER, VirtualConnection
-from tests.links.mavlink.mavlink_poses import HOST0, MS, good_pose
+from tests.links.mavlink.mavlink_poses import HOST0, MS, good_pose, position_of
 
 mavlink: Any = ardupilotmega
 
@@ -53,7 +54,7 @@ def test_the_session_stops_positions_without_yaw_when_the_autopilot_resets_its_y
     mav = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
     for boot_ms, yaw_deg, sent in ((1000, 30.0, 1), (1100, 30.0, 2), (1200, 60.0, 2)):
         list(session.receive(packed(attitude(boot_ms, yaw_deg), mav), PEER, HOST0))
-        session.send_pose(good_pose(HOST0 + (boot_ms - 1100) // 10 * MS))
+        session.send_pose(good_pose(HOST0 + (boot_ms - 1100) // 10 * MS, odom_yaw_rad=math.radians(30.0)))
         assert session.counters.get("sent: ODOMETRY", 0) == sent
     assert session.poses.rejected == {RejectReason.ODOM_YAW_RESET: 1}
 
@@ -90,7 +91,7 @@ def test_one_that_is_not_finite_is_ignored():
 
 def test_after_a_yaw_reset_no_position_is_sent_until_the_autopilot_boots():
     sender = PoseSender(("odometry",), PoseLimits(), yaw="none")
-    sender.autopilot.attitude = AutopilotAttitude(0.0, 0.0, 1.0, HOST0)
+    sender.autopilot.attitude = AutopilotAttitude(0.0, 0.0, 0.0, HOST0)
     sender.on_yaw_reset()  # before the first pose: the yaw is still learnt
     messages = sender.messages(good_pose(), HOST0)
     assert len(messages) == 1
@@ -99,12 +100,12 @@ def test_after_a_yaw_reset_no_position_is_sent_until_the_autopilot_boots():
     assert sender.messages(good_pose(HOST0 + 20 * MS), HOST0 + 20 * MS) == []
     assert sender.rejected == {RejectReason.ODOM_YAW_RESET: 1}
     sender.on_boot()
-    assert len(sender.messages(good_pose(HOST0 + 40 * MS, odom_yaw_rad=0.5), HOST0 + 40 * MS)) == 1
+    assert len(sender.messages(good_pose(HOST0 + 40 * MS, odom_yaw_rad=0.05), HOST0 + 40 * MS)) == 1
 
 
 def test_after_a_boot_no_position_is_sent_in_the_axes_of_before():
     sender = PoseSender(("odometry",), PoseLimits(), yaw="none")
-    sender.autopilot.attitude = AutopilotAttitude(0.0, 0.0, 1.0, HOST0)
+    sender.autopilot.attitude = AutopilotAttitude(0.0, 0.0, 0.0, HOST0)
     messages = sender.messages(good_pose(), HOST0)
     assert len(messages) == 1
     sender.on_sent(good_pose(), HOST0, messages)
@@ -119,7 +120,7 @@ def test_after_a_boot_no_position_is_sent_in_the_axes_of_before():
 @pytest.mark.parametrize("was_sent", [True, False])
 def test_after_several_boots_no_position_is_sent_in_the_axes_of_the_first(was_sent: bool):
     sender = PoseSender(("odometry",), PoseLimits(), yaw="none")
-    sender.autopilot.attitude = AutopilotAttitude(0.0, 0.0, 1.0, HOST0)
+    sender.autopilot.attitude = AutopilotAttitude(0.0, 0.0, 0.0, HOST0)
     messages = sender.messages(good_pose(), HOST0)
     if was_sent:
         sender.on_sent(good_pose(), HOST0, messages)
@@ -133,7 +134,7 @@ def test_after_several_boots_no_position_is_sent_in_the_axes_of_the_first(was_se
 
 def test_the_distance_from_the_first_position_adds_no_error():
     sender = PoseSender(("odometry",), PoseLimits(), yaw="none")
-    sender.autopilot.attitude = AutopilotAttitude(0.0, 0.0, 1.0, HOST0)
+    sender.autopilot.attitude = AutopilotAttitude(0.0, 0.0, 0.0, HOST0)
     first = good_pose()
     (near,) = sender.messages(first, HOST0)
     sender.on_sent(first, HOST0, [near])
@@ -142,9 +143,20 @@ def test_the_distance_from_the_first_position_adds_no_error():
     assert far.pose_covariance == near.pose_covariance
 
 
+@pytest.mark.parametrize(("compass_deg", "sent"), [(0.0, 1), (12.0, 1), (-30.0, 0), (170.0, 0)])
+def test_with_a_wrong_compass_no_position_is_sent_once_the_yaw_is_measured(compass_deg: float, sent: int):
+    """The body's yaw is 0 in map and in the learnt axes."""
+    sender = PoseSender(("odometry",), PoseLimits(), yaw="none")
+    sender.autopilot.attitude = AutopilotAttitude(0.0, 0.0, math.radians(compass_deg), HOST0)
+    pose = good_pose()
+    assert len(sender.messages(dataclasses.replace(pose, estimate=position_of(pose)), HOST0)) == 1
+    assert len(sender.messages(pose, HOST0)) == sent
+    assert sender.rejected == ({} if sent else {RejectReason.COMPASS: 1})
+
+
 def test_landing_target_alone_is_no_sending_of_poses():
     sender = PoseSender(("odometry", "landing_target"), PoseLimits(), yaw="none")
-    sender.autopilot.attitude = AutopilotAttitude(0.0, 0.0, 1.0, HOST0)
+    sender.autopilot.attitude = AutopilotAttitude(0.0, 0.0, 0.0, HOST0)
     first = good_pose()
     sender.on_sent(first, HOST0, sender.messages(first, HOST0))
     assert sender.sending
@@ -156,7 +168,7 @@ def test_landing_target_alone_is_no_sending_of_poses():
     sender.on_sent(later, later.stamp_ns, messages)
     assert not sender.sending
     sender.on_boot()
-    again = good_pose(HOST0 + 4000 * MS, odom_yaw_rad=0.5)
-    sender.autopilot.attitude = AutopilotAttitude(0.0, 0.0, 1.0, again.stamp_ns)
+    again = good_pose(HOST0 + 4000 * MS, odom_yaw_rad=0.05)
+    sender.autopilot.attitude = AutopilotAttitude(0.0, 0.0, 0.0, again.stamp_ns)
     assert {message.get_type() for message in sender.messages(again, again.stamp_ns)} == {"ODOMETRY", "LANDING_TARGET"}
     assert sender.reset_counter == (counter + 1) % 256

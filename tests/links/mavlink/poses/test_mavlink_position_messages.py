@@ -84,7 +84,10 @@ def test_a_position_sends_no_landing_target_and_a_full_pose_does():
     kinds = [message.get_type() for message in sent(pose_sender, position())]
     assert kinds == ["ODOMETRY"]
     assert pose_sender.rejected == {RejectReason.POSITION_ONLY: 1}
-    kinds = [message.get_type() for message in sent(pose_sender, good_pose(HOST0 + 20 * MS), HOST0 + 20 * MS)]
+    kinds = [
+        message.get_type()
+        for message in sent(pose_sender, good_pose(HOST0 + 20 * MS, odom_yaw_rad=2.0), HOST0 + 20 * MS)
+    ]
     assert kinds == ["ODOMETRY", "LANDING_TARGET"]
 
 

@@ -13,8 +13,10 @@ import typer
 
 from flow.link import LinkError
 from links.cli.console import EXIT_FAILED, report_errors
+from links.cli.options import Jobs, Scheduler
 from links.evaluation.association import EvaluationLimits
 
+PARQUET = ".parquet"
 JSON_FILE, DEFAULTS = "evaluation.json", EvaluationLimits()
 NEEDED = ("pandas", "matplotlib")  # evo is optional: without it its metrics are not evaluated
 
@@ -49,7 +51,12 @@ Reach = Annotated[
 
 @report_errors
 def evaluate_runs(
-    runs: Annotated[list[Path], typer.Argument(help="Folders written by `grd run` or `grd replay`, or TUM files.")],
+    runs: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Folders written by `grd run` or `grd replay`, or TUM files; or Parquet files of --parquet."
+        ),
+    ],
     against: Against = None,
     truth: Annotated[
         Path | None, typer.Option("--truth", help="TUM file of the true T_vehicle_drone [default: the run's own].")
@@ -65,10 +72,16 @@ def evaluate_runs(
     csv_file: Annotated[
         Path | None, typer.Option("--csv", help="CSV file of all metrics to write, a line a run.")
     ] = None,
+    parquet_file: Annotated[
+        Path | None,
+        typer.Option("--parquet", help="The same as a Parquet file, which grd evaluate reads in place of RUNS."),
+    ] = None,
     tables_file: TablesFile = None,
     max_gap_s: MaxGap = DEFAULTS.max_gap_s,
     max_age_s: MaxAge = DEFAULTS.max_age_s,
     reach_m: Reach = DEFAULTS.reach_m,
+    jobs: Jobs = 1,
+    scheduler: Scheduler = None,
 ) -> None:
     """Evaluate runs against truth.
 
@@ -80,6 +93,11 @@ def evaluate_runs(
     Example: grd evaluate out/street_sweep-replay --against out/street_sweep-paper --report out/compare.html
     """
     _check_installed()
+    tables = [path for path in runs if path.suffix == PARQUET]
+    if tables:
+        written = (against, truth, report, out_dir, csv_file, parquet_file, tables_file)
+        _show_tables(runs, tables, by or [], any(value is not None for value in written) or no_drone)
+        return
     if no_drone and truth is not None:
         raise LinkError("--no-drone and --truth contradict each other: give one of them")
     from links.cli.evaluate_output import Files, compare_and_show, evaluate_all
@@ -87,12 +105,22 @@ def evaluate_runs(
 
     keys = [parse_by(text) for text in by or []]
     limits = EvaluationLimits(max_gap_s=max_gap_s, max_age_s=max_age_s, reach_m=reach_m)
-    own, others = evaluate_all(runs, against or [], truth, no_drone, limits)
+    own, others = evaluate_all(runs, against or [], truth, no_drone, limits, scheduler or jobs)
     folder = out_dir or (report.parent if report else None)
-    files = Files(None if folder is None else folder / JSON_FILE, report, csv_file, tables_file)
+    files = Files(None if folder is None else folder / JSON_FILE, report, csv_file, parquet_file, tables_file)
     compare_and_show(own, others, keys, files)
     if any(e.findings for e in own):
         raise typer.Exit(EXIT_FAILED)
+
+
+def _show_tables(runs: list[Path], tables: list[Path], by: list[str], other_options: bool) -> None:
+    """Tables over the runs of Parquet files."""
+    if len(tables) < len(runs) or other_options:
+        raise LinkError(f"{tables[0]} is a table of evaluated runs: give tables alone, with --by and no other option")
+    from links.cli.evaluate_output import show_tables
+    from links.evaluation.groups import parse_by
+
+    show_tables(tables, [parse_by(text) for text in by])
 
 
 def _check_installed() -> None:

@@ -10,6 +10,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import pandas as pd
+
+from flow.jobs import Workers, run_all
 from flow.link import LinkError
 from links.cli.console import err, out, progress_bar, show_table, warn
 from links.evaluation.association import EvaluationLimits
@@ -41,8 +44,11 @@ from links.evaluation.tables import (
     label,
     metrics_table,
     not_evaluated_names,
+    read_parquet,
+    runs_table,
     some_of,
     write_csv,
+    write_parquet,
 )
 
 
@@ -53,21 +59,40 @@ class Files:
     numbers: Path | None
     report: Path | None
     csv: Path | None
+    parquet: Path | None
     paper_tables: Path | None
 
 
+@dataclass(frozen=True, slots=True)
+class EvaluationTask:
+    """A run to evaluate."""
+
+    run: Path
+    truth: Path | None
+    no_drone: bool
+    limits: EvaluationLimits
+
+
+def evaluate_one(task: EvaluationTask, report: Callable[[float], None]) -> list[Evaluation]:
+    """Evaluations of a run: of each output, for each drone with truth."""
+    parts = per_drone(read_run(task.run, task.truth, task.no_drone), task.limits)
+    return [evaluate(run, output, task.limits) for run in parts for output in run.outputs]
+
+
 def evaluate_all(
-    runs: list[Path], against: list[Path], truth: Path | None, no_drone: bool, limits: EvaluationLimits
+    runs: list[Path],
+    against: list[Path],
+    truth: Path | None,
+    no_drone: bool,
+    limits: EvaluationLimits,
+    workers: Workers = 1,
 ) -> tuple[list[Evaluation], list[Evaluation]]:
     """Evaluations of the runs, and of those that they are compared with."""
-    sides: tuple[list[Evaluation], list[Evaluation]] = [], []
-    paths = [*((path, 0) for path in runs), *((path, 1) for path in against)]
-    with progress_bar(f"evaluate {len(paths)} runs") as step:
-        for done, (path, side) in enumerate(paths):
-            parts = per_drone(read_run(path, truth, no_drone), limits)
-            sides[side].extend(evaluate(run, output, limits) for run in parts for output in run.outputs)
-            step(done + 1, len(paths))
-    return sides
+    tasks = [EvaluationTask(path, truth, no_drone, limits) for path in (*runs, *against)]
+    with progress_bar(f"evaluate {len(tasks)} runs") as step:
+        of_each = run_all(evaluate_one, tasks, workers, lambda shares: step(sum(shares), len(tasks)))
+    own, others = of_each[: len(runs)], of_each[len(runs) :]
+    return [e for part in own for e in part], [e for part in others for e in part]
 
 
 def compare_and_show(own: list[Evaluation], others: list[Evaluation], keys: list[Key], files: Files) -> None:
@@ -92,10 +117,29 @@ def compare_and_show(own: list[Evaluation], others: list[Evaluation], keys: list
         write_report(_made(files.report), own, others, pairs, warnings, summaries)
     if files.csv is not None:
         write_csv(_made(files.csv), own)
-    named = (("numbers", files.numbers), ("report", files.report), ("tables", files.paper_tables), ("table", files.csv))
+    if files.parquet is not None:
+        write_parquet(_made(files.parquet), own)
+    named = (
+        ("numbers", files.numbers),
+        ("report", files.report),
+        ("tables", files.paper_tables),
+        ("table", files.csv),
+        ("table", files.parquet),
+    )
     for name, file in named:
         if file is not None:
             out.print(f"{name:11} {file}", markup=False)
+
+
+def show_tables(files: list[Path], keys: list[Key]) -> None:
+    """Print the tables over all runs of Parquet files, without reading the runs again."""
+    runs = pd.concat([read_parquet(file) for file in files], ignore_index=True)
+    primary = runs.drop_duplicates(["run", "drone"])  # the first output of each run
+    flights, empty = primary[primary.no_drone == 0], primary[primary.no_drone == 1]
+    tables = [group_table(flights, key) for key in keys or [()] if len(flights)]
+    for table in [*tables, *([false_track_table(empty)] if len(empty) else [])]:
+        show_table(table.rich())
+        out.print(table.note, markup=False)
 
 
 def _made(file: Path) -> Path:
@@ -110,10 +154,10 @@ def _summaries(own: list[Evaluation], keys: list[Key]) -> list[Table]:
     flights = [e for e in primary if not e.run.no_drone]
     empty = [e for e in primary if e.run.no_drone]
     wanted = keys or ([()] if len(by_config(own)) > 1 else [])
-    tables = [group_table(flights, key) for key in wanted if flights]
+    tables = [group_table(runs_table(flights), key) for key in wanted if flights]
     tables += [table for key in wanted if (table := rotation_table(flights, key))]
     if empty and (wanted or len(empty) > 1):
-        tables.append(false_track_table(empty))
+        tables.append(false_track_table(runs_table(empty)))
     if (wanted or len(primary) > 1) and (table := reliability_table(primary)):
         tables.append(table)
     if (wanted or len(primary) > 1) and (table := probability_score_table(primary)):

@@ -29,6 +29,17 @@ HostsFile = Annotated[
     Path | None, typer.Option("--hosts", metavar="FILE", help="Live on several hosts: see links/zenoh/README.md.")
 ]
 HostName = Annotated[str | None, typer.Option("--host", metavar="NAME", help="Name of this host in FILE.")]
+Jobs = Annotated[
+    int, typer.Option("--jobs", min=1, max=256, help="Number of processes; it does not affect the results.")
+]
+Scheduler = Annotated[
+    str | None,
+    typer.Option(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="Run on the workers of a dask scheduler, as tcp://127.0.0.1:8786, with the same files at the same paths.",
+    ),
+]
 View = Annotated[bool, typer.Option("--view", help="Open the run in the Rerun viewer at its end.")]
 
 

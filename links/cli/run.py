@@ -11,21 +11,23 @@ from typing import Annotated
 import typer
 
 from flow.graph import recording_named
+from flow.jobs import Workers
 from flow.link import LinkError
 from flow.live.report import LiveReport
 from links.cli.console import EXIT_FAILED, err, out, progress_bar, report_errors, show_table, warn
 from links.cli.live_view import LiveView
-from links.cli.options import Config, HostName, HostsFile, Out, Overlay, Sets, View, place_of
+from links.cli.options import Config, HostName, HostsFile, Jobs, Out, Overlay, Scheduler, Sets, View, place_of
 from links.cli.run_output import nothing_found, print_result
 from links.cli.side_by_side import side_by_side
 from links.preflight.shipped_values import shipped_values
 from links.runs.as_live import rerun_into
 from links.runs.live_run import live_graph, run_live
+from links.runs.many import replay_all
 from links.runs.output_hashes import hash_matches
 from links.runs.request import RunRequest, RunResult
 from links.runs.results import SUMMARY_FILE
 from links.runs.run_folder import replay_into
-from links.runs.shipped import CONFIGS, shipped, shipped_option
+from links.runs.shipped import CONFIGS, shipped_all, shipped_option
 from links.runs.warm_up import warm_up, warm_up_graph
 from links.zenoh import host_graph
 
@@ -113,9 +115,13 @@ def run(
 
 @report_errors
 def replay_recording(
-    recording: Annotated[
-        Path,
-        typer.Argument(callback=shipped, help="A .mcap recording (`grd import` converts a .pcap or .tlog)."),
+    recordings: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="RECORDING...",
+            callback=shipped_all,
+            help="A .mcap recording (`grd import` converts a .pcap or .tlog), or several.",
+        ),
     ],
     config: Annotated[
         Path | None,
@@ -136,8 +142,13 @@ def replay_recording(
         typer.Option("--expect", metavar="HASH", help="Exit code 1 unless the output hash is this one."),
     ] = None,
     view: View = False,
+    jobs: Jobs = 1,
+    scheduler: Scheduler = None,
 ) -> None:
     """Replay RECORDING, deterministic and as fast as possible.
+
+    Several recordings are replayed into folders of --out [default: out], on --jobs processes or the workers of
+    --scheduler; complete runs with the same settings are kept.
 
     The first part of a split recording stands for all parts; a later part is replayed alone. --expect takes a whole
     output hash or its first 16 digits: those cover the values, the rest covers the reason texts. With --as-live each
@@ -148,6 +159,13 @@ def replay_recording(
     """
     if not hashed and (as_live or expect is not None):
         raise LinkError("--no-hash: --as-live and --expect compare the output hash, leave one of them out")
+    if len(recordings) > 1 or scheduler is not None:
+        if as_live or expect is not None or view:
+            raise LinkError("--as-live, --expect and --view are for one recording: leave them out")
+        request = RunRequest(config or DEFAULT_REPLAY_CONFIG, tuple(overlay or ()), tuple(sets or ()))
+        _replay_all(recordings, request, out_dir or Path("out"), scheduler or jobs, hashed)
+        return
+    recording = recordings[0]
     if as_live:
         if config or overlay or sets:
             raise LinkError(
@@ -160,6 +178,15 @@ def replay_recording(
         output_hash = result.output_hash
     if expect is not None and output_hash is not None and not hash_matches(expect, output_hash):
         err.print(f"the output hash is {output_hash}, expected {expect}", markup=False, style="red")
+        raise typer.Exit(EXIT_FAILED)
+
+
+def _replay_all(recordings: list[Path], request: RunRequest, out_dir: Path, workers: Workers, hashed: bool) -> None:
+    with progress_bar(f"replay {len(recordings)} recordings") as step:
+        outcomes = replay_all(recordings, request, out_dir, workers, step, hashed=hashed)
+    for outcome in outcomes:
+        (err if outcome.failure else out).print(str(outcome), markup=False, style="red" if outcome.failure else "")
+    if any(outcome.failure for outcome in outcomes):
         raise typer.Exit(EXIT_FAILED)
 
 

@@ -26,11 +26,11 @@ from links.evaluation.stage_metrics import (
     candidate_outcomes,
     probability_outcomes,
 )
-from links.evaluation.tables import OBJECT, Table, by_config, number_text, runs_table
+from links.evaluation.tables import OBJECT, REACQUISITIONS, Table, by_config, number_text, runs_table
 
 CONFIG, ALL = "config", "all"
 Key = tuple[int, ...]  # fields of the recording's name that a table is grouped by; none: all runs are one group
-Group = tuple[tuple[str, ...], str, list[Evaluation]]  # fields, configuration, runs
+Group = tuple[tuple[str, ...], str, pd.DataFrame]  # fields, configuration, runs (`runs_table`)
 Statistic = Callable[[pd.DataFrame], float]  # of the runs of a group (`runs_table`); NaN where there is none
 Columns = dict[str, tuple[int, Statistic]]  # by heading: decimals, statistic
 
@@ -79,7 +79,7 @@ def _reacquisition(statistic: Callable[[pd.Series], float]) -> Statistic:
     """A statistic of the times to reacquire of all occlusions."""
 
     def of_runs(runs: pd.DataFrame) -> float:
-        times_s = pd.Series([t for e in runs[OBJECT] for t in e.reacquisition_s], dtype=float)
+        times_s = pd.Series([t for times in runs[REACQUISITIONS] for t in times], dtype=float)
         return statistic(times_s) if len(times_s) else math.nan
 
     return of_runs
@@ -203,26 +203,25 @@ def parse_by(text: str) -> Key:
     return tuple(fields)
 
 
-def grouped(evaluations: Sequence[Evaluation], key: Key) -> list[Group]:
-    """Each combination of fields and configurations; all runs together last.
+def grouped(runs: pd.DataFrame, key: Key) -> list[Group]:
+    """Each combination of fields and configurations of a `runs_table`; all runs together last.
 
     Numbers are in their order, configurations as they were given. LinkError when a name has no such field.
     """
-    configs = list(by_config(list(evaluations)))
-    cells: dict[tuple[str, ...], list[Evaluation]] = {}
-    for e in evaluations:
-        fields = e.run.recording.split("-")
+    cells: dict[tuple[str, ...], list[int]] = {}
+    for row, recording in enumerate(runs.recording):
+        fields = recording.split("-")
         if max(key, default=0) > len(fields):
-            raise LinkError(f"--by {max(key)}: '{e.run.recording}' has {len(fields)} fields, joined by '-'")
-        cells.setdefault(tuple(fields[number - 1] for number in key), []).append(e)
+            raise LinkError(f"--by {max(key)}: '{recording}' has {len(fields)} fields, joined by '-'")
+        cells.setdefault(tuple(fields[number - 1] for number in key), []).append(row)
     rows = [(fields, cells[fields]) for fields in sorted(cells, key=lambda fields: [_natural(text) for text in fields])]
     if key:
-        rows.append(((ALL, *[""] * (len(key) - 1)), list(evaluations)))
+        rows.append(((ALL, *[""] * (len(key) - 1)), list(range(len(runs)))))
     return [
         (fields, config, own)
         for fields, several in rows
-        for config in configs
-        if (own := [e for e in several if e.run.config == config])
+        for config in dict.fromkeys(runs.config)
+        if len(own := runs.iloc[[row for row in several if runs.config.iloc[row] == config]])
     ]
 
 
@@ -232,19 +231,24 @@ def _natural(text: str) -> list[tuple[int, int | str]]:
 
 def group_numbers(groups: list[Group], columns: Columns = COLUMNS) -> pd.DataFrame:
     """The statistics of each group, one row for each."""
-    tables = [runs_table(own) for *_, own in groups]
-    return pd.DataFrame({head: [float(statistic(t)) for t in tables] for head, (_, statistic) in columns.items()})
+    runs = [own for *_, own in groups]
+    return pd.DataFrame({head: [float(statistic(own)) for own in runs] for head, (_, statistic) in columns.items()})
 
 
-def group_table(evaluations: Sequence[Evaluation], key: Key) -> Table:
-    """Groups down, statistics across; the configuration is a column when there are several or nothing else is."""
-    return _table("", grouped(evaluations, key), key, COLUMNS, NOTE)
+def group_table(runs: pd.DataFrame, key: Key) -> Table:
+    """Groups of a `runs_table` down, statistics across.
+
+    The configuration is a column when there are several or nothing else is.
+    """
+    return _table("", grouped(runs, key), key, COLUMNS, NOTE)
 
 
 def rotation_table(evaluations: Sequence[Evaluation], key: Key) -> Table | None:
     """The same for the rotation by both cameras; None when no run has one."""
     asked = [e for e in evaluations if e.values["rotation_images"].value is not None]
-    return _table(f"{CAMERAS}, ", grouped(asked, key), key, ROTATION_COLUMNS, ROTATION_NOTE) if asked else None
+    if not asked:
+        return None
+    return _table(f"{CAMERAS}, ", grouped(runs_table(asked), key), key, ROTATION_COLUMNS, ROTATION_NOTE)
 
 
 def _table(title: str, groups: list[Group], key: Key, columns: Columns, note: str) -> Table:
@@ -253,13 +257,10 @@ def _table(title: str, groups: list[Group], key: Key, columns: Columns, note: st
     if not key or len(set(configs)) > 1:
         frame[CONFIG] = configs
     labels, empty = frame.shape[1], []
-    failed_s = [
-        min((e.duration_s or 0.0 for e in own if e.values["first_accurate_s"].failed), default=None)
-        for *_, own in groups
-    ]
+    failed_s = [own.span_s[np.isinf(own.first_accurate_s)].fillna(0.0).min() for *_, own in groups]
     numbers = group_numbers(groups, columns)
     for head, (decimals, _) in columns.items():
-        never = failed_s if head in FIRST_ACCURATE else [None] * len(groups)
+        never = [None if s is None or math.isnan(s) or head not in FIRST_ACCURATE else s for s in failed_s]
         if np.isnan(numbers[head].to_numpy()).all():
             empty.append(head.replace("\n", " "))
         else:
@@ -268,33 +269,30 @@ def _table(title: str, groups: list[Group], key: Key, columns: Columns, note: st
     return Table(f"{title}by {by}", frame, labels, note + (f" Without values: {', '.join(empty)}." if empty else ""))
 
 
-def false_track_numbers(evaluations: list[Evaluation]) -> pd.DataFrame:
-    """Runs without a drone, one row for each configuration; runs whose length is not known are left out.
+def false_track_numbers(runs: pd.DataFrame) -> pd.DataFrame:
+    """Runs without a drone of a `runs_table`, one row for each configuration; of unknown length: left out.
 
     The rate of false tracks has a one-sided 95 % bound of a Poisson process: tracks are independent, outputs are not.
     """
     rows: list[dict[str, object]] = []
-    for config, several in by_config([e for e in evaluations if e.duration_s is not None]).items():
-        hours = sum(e.duration_s or 0.0 for e in several) / 3600
-        tracks = int(sum(e.values["false_tracks"].value or 0 for e in several))
-        detections = sum(len(search.accepted_xyz_m) for e in several for search in e.run.searches or ())
-        outputs = sum(len(e.output.poses) for e in several)
+    for config, several in runs[runs.span_s.notna()].groupby("config", sort=False):
+        hours = float(several.span_s.sum()) / 3600
+        tracks = int(several.false_tracks.sum())
         row = {
             CONFIG: config,
             "runs": len(several),
             "hours": hours,
-            "outputs": outputs,
-            "false\ndetections": detections,
+            "outputs": int(several.outputs.sum()),
+            "false\ndetections": int(several.detections.sum()),
         }
         row |= {"false\ntracks": tracks, "[/h]": tracks / hours, "below [/h]\n(95 %)": poisson_upper(tracks) / hours}
         rows.append(row)
     return pd.DataFrame(rows)
 
 
-def false_track_table(evaluations: list[Evaluation]) -> Table:
-    """Configurations down; the note names the recordings with false tracks."""
-    frame = false_track_numbers(evaluations).map(lambda x: f"{x:.3g}" if isinstance(x, float) else str(x))
-    runs = runs_table(evaluations)
+def false_track_table(runs: pd.DataFrame) -> Table:
+    """Configurations of a `runs_table` down; the note names the recordings with false tracks."""
+    frame = false_track_numbers(runs).map(lambda x: f"{x:.3g}" if isinstance(x, float) else str(x))
     false = runs[runs.false_tracks > 0].groupby(["config", "recording"], sort=False).false_tracks.sum()
     notes: list[str] = []
     for config, counts in false.groupby("config", sort=False):

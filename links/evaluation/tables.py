@@ -17,6 +17,7 @@ import pandas as pd
 from rich.table import Table as RichTable
 from rich.text import Text
 
+from flow.link import LinkError
 from links.evaluation.evaluation import Evaluation, MetricStatus, Value
 from links.evaluation.metrics import CATALOGUE, Metric, metric_of, rank
 
@@ -25,6 +26,8 @@ MAX_NAMED = 4  # names in a text
 MAX_COLUMNS = 4  # a terminal shows the metrics of so many runs in columns, of more as rows of headlines
 HTML_COLUMNS = 13  # without the labels, so that a page is not wider than a screen
 OBJECT = "evaluation"  # column of `runs_table` with the Evaluation itself
+REACQUISITIONS = "reacquisition_times_s"  # column of `runs_table` with a list: after each occlusion, inf: never
+TABLE_VERSION = "1"  # of a Parquet table; another one has other columns
 TIMED_SHARES = ("detection_rate", "observable_detection_rate", "return_share", "observable_share")
 COUNTED_SHARES = (*TIMED_SHARES, "precision", "inside_95_share", "rotation_accepted_share", "rotation_inside_95_share")
 HEADLINES = {
@@ -72,6 +75,8 @@ def runs_table(evaluations: Sequence[Evaluation]) -> pd.DataFrame:
     about["no_drone"] = [int(e.run.no_drone) for e in evaluations]
     about["span_s"] = [math.nan if e.duration_s is None else e.duration_s for e in evaluations]
     about["outputs"] = [len(e.output.poses) for e in evaluations]
+    about["detections"] = [sum(len(s.accepted_xyz_m) for s in e.run.searches or ()) for e in evaluations]
+    about[REACQUISITIONS] = [list(e.reacquisition_s) for e in evaluations]
     pooled: dict[str, object] = {}
     for key in COUNTED_SHARES:
         for index, what in enumerate(("count", "of")):
@@ -110,7 +115,25 @@ def _by(evaluations: Sequence[Evaluation], name: Callable[[Evaluation], str]) ->
 
 def write_csv(path: Path, evaluations: list[Evaluation]) -> None:
     """Write the metrics of all runs, one line for each. `inf` or `-inf` is a failure, empty is not evaluated."""
-    runs_table(evaluations).drop(columns=OBJECT).to_csv(path, index=False, float_format="%.12g")
+    runs_table(evaluations).drop(columns=[OBJECT, REACQUISITIONS]).to_csv(path, index=False, float_format="%.12g")
+
+
+def write_parquet(path: Path, evaluations: list[Evaluation]) -> None:
+    """The same as a Parquet file, with the times to reacquire as lists; `read_parquet` reads it."""
+    runs = runs_table(evaluations).drop(columns=OBJECT)
+    runs.attrs["grd_table"] = TABLE_VERSION
+    runs.to_parquet(path, index=False)
+
+
+def read_parquet(path: Path) -> pd.DataFrame:
+    """A table of runs that `write_parquet` wrote, without the evaluations themselves. LinkError: it is none."""
+    try:
+        runs = pd.read_parquet(path)
+    except (OSError, ValueError) as error:
+        raise LinkError(f"{path}: not a Parquet table: {error}") from None
+    if runs.attrs.get("grd_table") != TABLE_VERSION:
+        raise LinkError(f"{path}: not a table of this version of grd: write it with grd evaluate RUNS --parquet FILE")
+    return runs
 
 
 @dataclass(frozen=True, slots=True)

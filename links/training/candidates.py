@@ -10,7 +10,7 @@ Source: grd.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from flow.config.yaml_text import YamlTextError, yaml_values
+from flow.jobs import Workers, run_all
 from flow.link import LinkError
 from links.evaluation.association import EvaluationLimits, interpolate, read_true_drones
 from links.evaluation.text_files import Flags
@@ -62,12 +63,13 @@ class CandidateRows:
         return ~np.isnan(self.feature("over_static_nats"))
 
 
-def read_candidates(runs: Sequence[Path], thin: bool = True) -> CandidateRows:
-    """The rows of all runs.
+def read_candidates(runs: Sequence[Path], thin: bool = True, workers: Workers = 1) -> CandidateRows:
+    """The rows of all runs, read on workers.
 
     LinkError for a run without truth, without a seed in its name, with other features, or without a required one.
     """
-    parts = [_read(folder, index, thin) for index, folder in enumerate(runs)]
+    tasks = [ReadTask(folder, index, thin) for index, folder in enumerate(runs)]
+    parts = run_all(read_one, tasks, workers, lambda shares: None)
     frame = pd.concat([part for part in parts if len(part)])
     if frame.empty:
         raise LinkError("no run has candidates")
@@ -102,7 +104,18 @@ def _lidar_model(folder: Path) -> LidarModel:
         raise LinkError(f"{file}: {error}") from None
 
 
-def _read(folder: Path, index: int, thin: bool) -> pd.DataFrame:
+@dataclass(frozen=True)
+class ReadTask:
+    """A run whose candidates are read."""
+
+    folder: Path
+    index: int
+    thin: bool
+
+
+def read_one(task: ReadTask, report: Callable[[float], None]) -> pd.DataFrame:
+    """The rows of one run."""
+    folder, index, thin = task.folder, task.index, task.thin
     file = folder / results.CANDIDATES_FILE
     if not file.exists():
         if (folder / results.SUMMARY_FILE).exists():

@@ -15,6 +15,7 @@ import typer
 
 from flow.link import LinkError
 from links.cli.console import err, out, report_errors
+from links.cli.options import Jobs, Scheduler
 
 if TYPE_CHECKING:
     from links.training.candidates import CandidateRows
@@ -45,6 +46,8 @@ def train_detector(
     ablation: Annotated[
         bool, typer.Option("--ablation", help="Also train without each group of features, and score these models.")
     ] = False,
+    jobs: Jobs = 1,
+    scheduler: Scheduler = None,
 ) -> None:
     """Train the detector's model and score it on held-out runs.
 
@@ -61,7 +64,8 @@ def train_detector(
     if ablation and not held_out:
         raise LinkError("--ablation needs --held-out: the models without a group are scored on these runs")
 
-    rows, lidar_model = read_candidates(runs), lidar_model_of(runs)
+    workers = scheduler or jobs
+    rows, lidar_model = read_candidates(runs, workers=workers), lidar_model_of(runs)
     folders = [run for folder in held_out or [] for run in sorted(folder.iterdir()) if run.is_dir()]
     trained: dict[str, Any] = {
         "command": _command(runs, out_file, held_out or [], left_out or [], start_file, ablation),
@@ -75,7 +79,7 @@ def train_detector(
     model = train(rows, trained, left_out or [], lidar_model, start)
     _warn_of_end(trained["strength"])
     if folders:
-        unseen = read_candidates(folders)
+        unseen = read_candidates(folders, workers=workers)
         trained["held_out"] = _compared(unseen, predicted(model, unseen))
         for group in ("nothing", *GROUPS) if ablation else ():
             names = [feature.name for feature in FEATURES if feature.group == group]

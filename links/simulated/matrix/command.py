@@ -12,6 +12,7 @@ import typer
 
 from flow.link import LinkError
 from links.cli.console import EXIT_FAILED, EXIT_USAGE, err, out, progress_bar, report_errors, warn
+from links.cli.options import Jobs, Scheduler
 from links.cli.simulate import ClosedLoop, not_installed
 from links.runs.shipped import shipped, shipped_all
 from stages.geometry.lidar_models import LIDAR_MODELS
@@ -23,17 +24,6 @@ if TYPE_CHECKING:  # the simulator is an optional dependency
     from links.simulated.matrix.making import MatrixReport
     from links.simulated.matrix.matrix import Conditions
 
-JobsOption = Annotated[
-    int, typer.Option("--jobs", min=1, max=256, help="Number of processes; it does not affect the results.")
-]
-SchedulerOption = Annotated[
-    str | None,
-    typer.Option(
-        "--scheduler",
-        metavar="ADDRESS",
-        help="Run on the workers of a dask scheduler, as tcp://127.0.0.1:8786, with the same files at the same paths.",
-    ),
-]
 Folder = Annotated[Path, typer.Argument(help="Folder for the recordings, one per cell and seed.")]
 Seeds = Annotated[int, typer.Option("--seeds", min=1, max=1000, help="Number of seeds per cell.")]
 FirstSeed = Annotated[int, typer.Option("--first-seed", min=0, help="First seed.")]
@@ -132,8 +122,8 @@ def simulate_matrix(
     readout_ms: ReadoutMs = None,
     images: ImagesFrom = None,
     results: Results = None,
-    jobs: JobsOption = 1,
-    scheduler: SchedulerOption = None,
+    jobs: Jobs = 1,
+    scheduler: Scheduler = None,
     list_only: ListOnly = False,
 ) -> None:
     """Make the recordings of the scenario matrix.
@@ -254,8 +244,8 @@ def fly_scenarios(
         list[str] | None,
         typer.Option("--set", metavar="KEY=VALUE", help="Change a setting of all scenarios; repeatable."),
     ] = None,
-    jobs: JobsOption = 1,
-    scheduler: SchedulerOption = None,
+    jobs: Jobs = 1,
+    scheduler: Scheduler = None,
 ) -> None:
     """Fly scenarios in closed loop and write a table: OUT/flights.md, and OUT/flights.csv with a line per flight.
 

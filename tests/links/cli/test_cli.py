@@ -60,6 +60,9 @@ def test_a_run_prints_the_pose_of_the_drone_its_errors_and_the_result_files(grd,
     for what in ("LiDAR positions against the truth, rmse_3d_m: 0.", "fused poses against the truth, rmse_xyz_m: [0."):
         assert what in info
     folder = tmp_path / "out" / "street_sweep-estimate"
+    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs/how-to/query-runs.md").read_text(), re.S)
+    shown = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True).stdout
+    assert re.search(r"^\d{3,} poses; .*sensor_time", shown)
     for words in (
         "vehicle frame",
         "yaw [deg]",
@@ -154,6 +157,23 @@ def test_a_replay_without_the_hash_leaves_the_same_fixes(grd, tmp_path):
     fixes = [(tmp_path / name / "fix_vehicle_drone.tum").read_text() for name in "ab"]
     assert fixes[0] == fixes[1]
     assert "--no-hash" in grd("replay", STREET, "--no-hash", "--expect", "0" * 16, code=2)
+
+
+def test_several_recordings_are_replayed_on_processes_and_complete_runs_are_kept(grd, tmp_path):
+    pytest.importorskip("distributed")
+    for name in ("one", "two"):
+        shutil.copy(STREET, tmp_path / f"{name}.mcap")
+    (tmp_path / "broken.mcap").write_bytes(b"no recording")
+    several = ("replay", "one.mcap", "broken.mcap", "two.mcap", "--overlay", without_viewer(tmp_path), "--out", "runs")
+    text = grd(*several, "--jobs", "2", code=1)
+    summaries = [json.loads((tmp_path / "runs" / f"{n}-replay" / "summary.json").read_text()) for n in ("one", "two")]
+    pinned = json.loads((ROOT / "recordings" / "hashes.json").read_text())["street_sweep.mcap"]["replay"]
+    assert {summary["output_hash"] for summary in summaries} == {pinned}
+    assert text.count(": made, output hash") == 2
+    assert "broken.mcap: " in text
+    assert grd(*several, code=1).count(": kept, output hash") == 2
+    assert "for one recording" in grd("replay", "one.mcap", "two.mcap", "--expect", "0" * 16, code=2)
+    assert "several recordings are named one" in grd("replay", "one.mcap", tmp_path / "one.mcap", code=2)
 
 
 @pytest.mark.skipif(not can_use_subprocesses(), reason="one core, or no fork: there is one process anyway")

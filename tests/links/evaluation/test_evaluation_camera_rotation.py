@@ -294,7 +294,7 @@ def three_flights(tmp_path):
 
 def test_rotations_of_a_group_are_one_series(three_flights):
     evaluations = [evaluated(folder) for folder in three_flights]
-    table = group_numbers(grouped(evaluations, ()), ROTATION_COLUMNS)
+    table = group_numbers(grouped(runs_table(evaluations), ()), ROTATION_COLUMNS)
     table.columns = [head.replace("\n", " ") for head in table.columns]
     estimate, paper = table.to_dict("records")
     assert (estimate["runs"], estimate["images"], paper["images"]) == (2, 160, 80)

@@ -21,7 +21,7 @@ from links.evaluation.groups import (
     quantile_95,
 )
 from links.evaluation.run_data import OutputKind, read_run
-from links.evaluation.tables import median_columns, medians, runs_table
+from links.evaluation.tables import median_columns, medians, read_parquet, runs_table
 from tests.command import grd
 from tests.links.evaluation.made_runs import add_pose, all_evaluated, evaluated, make_run, truth_at, yaw_quaternion
 
@@ -30,7 +30,7 @@ T_S = np.arange(0.0, 10.0, 0.1)
 
 def numbers(evaluations, key):
     """Statistics of each group by heading, with line breaks as spaces, and the fields of the group."""
-    groups = grouped(evaluations, key)
+    groups = grouped(runs_table(evaluations), key)
     table = group_numbers(groups)
     table.columns = [head.replace("\n", " ") for head in table.columns]
     rows = zip(table.to_dict("records"), groups, strict=True)
@@ -94,13 +94,13 @@ def test_numbers_are_in_their_order_and_each_run_is_in_one_group(three_runs):
 
 
 def test_several_fields_are_cells(three_runs):
-    fields = [fields for fields, *_ in grouped(three_runs, (2, 1))]
+    fields = [fields for fields, *_ in grouped(runs_table(three_runs), (2, 1))]
     assert fields == [("10m", "park"), ("10m", "street"), ("20m", "street"), ("all", "")]
 
 
 def test_a_missing_field_is_an_error(three_runs):
     with pytest.raises(LinkError, match=r"--by 4: 'street-10m-s1' has 3 fields"):
-        grouped(three_runs, (4,))
+        grouped(runs_table(three_runs), (4,))
 
 
 @pytest.mark.parametrize(("text", "key"), [("2", (2,)), ("3,1", (3, 1)), ("config", ()), ("config, 2", (2,))])
@@ -187,11 +187,11 @@ def test_poses_that_the_autopilot_gate_accepts_are_summed_up(tmp_path):
     (group,) = numbers(poses, ())
     assert group["sent [%]"] == pytest.approx(25.0, abs=0.5)
     assert group["sent: max [m]"] == pytest.approx(0.3)
-    assert group_table(poses, ()).frame["sent:\nmax [m]"].tolist() == ["0.30"]
+    assert group_table(runs_table(poses), ()).frame["sent:\nmax [m]"].tolist() == ["0.30"]
 
 
 def test_one_row_for_each_configuration_is_the_table_of_ablations(two_configs):
-    table = group_table(all_evaluated(*two_configs), ())
+    table = group_table(runs_table(all_evaluated(*two_configs)), ())
     assert table.frame.columns[:2].tolist() == ["config", "runs"]
     assert table.frame[["config", "runs"]].to_numpy().tolist() == [["paper", "2"], ["estimate", "2"]]
     assert table.frame["first accurate\n95 % [s]"].tolist() == [">10", "0.0"]
@@ -257,7 +257,7 @@ def test_runs_without_a_drone_are_pooled_with_a_bound_and_named(tmp_path):
         make_run(tmp_path / "b", [], [], truth="no drone", duration_s=1800, recording="y", config="estimate"),
         make_run(tmp_path / "c", [], [], truth="no drone", duration_s=1800, recording="x", config="paper"),
     )
-    estimate, paper = false_track_numbers(runs).to_dict("records")
+    estimate, paper = false_track_numbers(runs_table(runs)).to_dict("records")
     assert (estimate["runs"], estimate["outputs"], estimate["false\ntracks"]) == (2, 6, 2)
     assert estimate["[/h]"] == pytest.approx(2.0)
     assert estimate["below [/h]\n(95 %)"] == pytest.approx(6.296, abs=1e-3)  # Poisson, 2 events
@@ -279,6 +279,35 @@ def test_the_command_puts_configurations_side_by_side(two_configs, tmp_path):
     assert list(median_columns(all_evaluated(*two_configs))) == ["paper: median of 2", "estimate: median of 2"]
     assert "--by 9: 'a-10m-s1' has 3 fields" in grd("evaluate", *two_configs, "--by", "9", code=2)
     assert "with --by config" in grd("evaluate", *two_configs, "--against", two_configs[0], code=2)
+
+
+def test_a_parquet_table_gives_the_same_tables_as_the_runs(two_configs, tmp_path):
+    empty = make_run(tmp_path / "empty", [], [], truth="no drone", duration_s=900, recording="x", config="paper")
+    file = tmp_path / "new" / "runs.parquet"
+    by = ("--by", "2,1", "--by", "config")
+    of_runs = grd("evaluate", *two_configs, empty, *by, "--parquet", file, code=1)
+    of_table = grd("evaluate", file, *by)
+    rows = [line for line in of_table.splitlines() if line.startswith("│")]
+    assert len(rows) >= 8
+    assert [row for row in rows if row not in of_runs] == []
+    more = read_parquet(file)
+    assert len(more) == len(all_evaluated(*two_configs, empty))
+    assert "give tables alone" in grd("evaluate", file, two_configs[0], code=2)
+    assert "give tables alone" in grd("evaluate", file, "--csv", tmp_path / "a.csv", code=2)
+
+
+def test_another_file_is_no_table(tmp_path):
+    (tmp_path / "text.parquet").write_text("not one")
+    assert "not a Parquet table" in grd("evaluate", tmp_path / "text.parquet", code=2)
+    pd.DataFrame({"a": [1]}).to_parquet(tmp_path / "other.parquet")
+    assert "--parquet FILE" in grd("evaluate", tmp_path / "other.parquet", code=2)
+
+
+def test_runs_evaluated_on_two_processes_have_the_same_metrics(two_configs, tmp_path):
+    pytest.importorskip("distributed")
+    for jobs in ("1", "2"):
+        grd("evaluate", *two_configs, "--csv", tmp_path / f"{jobs}.csv", "--jobs", jobs, code=1)
+    assert (tmp_path / "1.csv").read_text() == (tmp_path / "2.csv").read_text()
 
 
 def test_the_csv_table_has_a_line_for_each_run(two_configs, tmp_path):

@@ -61,7 +61,9 @@ def test_a_run_prints_the_pose_of_the_drone_its_errors_and_the_result_files(grd,
         assert what in info
     folder = tmp_path / "out" / "street_sweep-estimate"
     (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs/how-to/query-runs.md").read_text(), re.S)
-    shown = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True).stdout
+    shown = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True
+    ).stdout
     assert re.search(r"^\d{3,} poses; .*sensor_time", shown)
     for words in (
         "vehicle frame",

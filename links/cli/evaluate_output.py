@@ -135,7 +135,7 @@ def show_tables(files: list[Path], keys: list[Key]) -> None:
     """Print the tables over all runs of Parquet files, without reading the runs again."""
     runs = pd.concat([read_parquet(file) for file in files], ignore_index=True)
     primary = runs.drop_duplicates(["run", "drone"])  # the first output of each run
-    flights, empty = primary[primary.no_drone == 0], primary[primary.no_drone == 1]
+    flights, empty = primary.query("no_drone == 0"), primary.query("no_drone == 1")
     tables = [group_table(flights, key) for key in keys or [()] if len(flights)]
     for table in [*tables, *([false_track_table(empty)] if len(empty) else [])]:
         show_table(table.rich())

@@ -29,7 +29,7 @@ MAX_SPEED_MPS, MAX_CLIMB_MPS = 5.0, 2.5
 MAX_INTEGRAL_MPS2 = 4.0
 ACCELERATION_MPS2 = 1.0  # of the speed profile along a leg
 LAND_MPS, LAND_FAST_MPS, LAND_FAST_ABOVE_M = 0.5, 1.5, 10.0  # LAND_SPEED, WPNAV_SPEED_DN, LAND_ALT_LOW
-CORNER_STOP_S = 1.0
+SQUARE, CORNER_STOP_S = ((0, 0), (1, 0), (1, 1), (0, 1)), 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +91,7 @@ class Guidance:
             if step.yaw_deg is not None:
                 self.target.yaw_rad = math.radians(step.yaw_deg) + frame.yaw_rad
         elif isinstance(step, Square):
-            self._square(step, since_s)
+            self._square(step, since_s, frame)
         elif isinstance(step, Follow):
             self._follow(time_s, frame)
         return self.target
@@ -114,8 +114,8 @@ class Guidance:
         self.target.velocity_mps = speed * away / length if length > 1e-9 else np.zeros(3)
         return duration_s
 
-    def _square(self, step: Square, since_s: float) -> None:
-        corners = step.side_m * np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    def _square(self, step: Square, since_s: float, frame: SurveyFrame) -> None:
+        corners = [rotate(step.side_m * np.array([x, y, 0.0]), frame.yaw_rad) for x, y in SQUARE]
         leg_s = trapezoid(step.side_m, step.speed_mps, 0.0)[2] + CORNER_STOP_S
         leg = int(since_s // leg_s)
         self._leg(self._from + corners[leg % 4], self._from + corners[(leg + 1) % 4], step.speed_mps, since_s % leg_s)

@@ -110,7 +110,7 @@ class GoTo(StrictModel):
 
 
 class Square(StrictModel):
-    """Fly squares from the present target, along the axes of the estimate's frame, with a stop at each corner."""
+    """Fly squares from the present target, along the axes of the world, with a stop at each corner."""
 
     do: Literal["square"] = "square"
     side_m: float = Field(default=4.0, gt=0)

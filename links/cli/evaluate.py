@@ -93,10 +93,9 @@ def evaluate_runs(
     Example: grd evaluate out/street_sweep-replay --against out/street_sweep-paper --report out/compare.html
     """
     _check_installed()
-    tables = [path for path in runs if path.suffix == PARQUET]
-    if tables:
-        written = (against, truth, report, out_dir, csv_file, parquet_file, tables_file)
-        _show_tables(runs, tables, by or [], any(value is not None for value in written) or no_drone)
+    if tables := [path for path in runs if path.suffix == PARQUET]:
+        others = (against, truth, report, out_dir, csv_file, parquet_file, tables_file, no_drone or None)
+        _show_tables(runs, tables, by or [], any(option is not None for option in others))
         return
     if no_drone and truth is not None:
         raise LinkError("--no-drone and --truth contradict each other: give one of them")
@@ -105,10 +104,10 @@ def evaluate_runs(
 
     keys = [parse_by(text) for text in by or []]
     limits = EvaluationLimits(max_gap_s=max_gap_s, max_age_s=max_age_s, reach_m=reach_m)
-    own, others = evaluate_all(runs, against or [], truth, no_drone, limits, scheduler or jobs)
+    own, compared = evaluate_all(runs, against or [], truth, no_drone, limits, scheduler or jobs)
     folder = out_dir or (report.parent if report else None)
     files = Files(None if folder is None else folder / JSON_FILE, report, csv_file, parquet_file, tables_file)
-    compare_and_show(own, others, keys, files)
+    compare_and_show(own, compared, keys, files)
     if any(e.findings for e in own):
         raise typer.Exit(EXIT_FAILED)
 

@@ -22,11 +22,10 @@ from links.cli.side_by_side import side_by_side
 from links.preflight.shipped_values import shipped_values
 from links.runs.as_live import rerun_into
 from links.runs.live_run import live_graph, run_live
-from links.runs.many import replay_all
 from links.runs.output_hashes import hash_matches
 from links.runs.request import RunRequest, RunResult
 from links.runs.results import SUMMARY_FILE
-from links.runs.run_folder import replay_into
+from links.runs.run_folder import replay_all, replay_into
 from links.runs.shipped import CONFIGS, shipped_all, shipped_option
 from links.runs.warm_up import warm_up, warm_up_graph
 from links.zenoh import host_graph

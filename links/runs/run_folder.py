@@ -1,6 +1,8 @@
 """The output folder of a run: configuration, results, errors against the truth, and a summary.
 
-A replay, a live run and a simulated closed loop leave the same files.
+A replay, a live run and a simulated closed loop leave the same files. Replays of several recordings (`replay_all`) are
+independent tasks: a folder that holds a complete run of the same recording and settings is kept, and a recording that
+fails does not stop the others.
 
 Source: DESIGN, Outputs of a run.
 """
@@ -9,15 +11,21 @@ from __future__ import annotations
 
 import json
 import time
+from collections import Counter
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 from flow.config.draw import mermaid
+from flow.config_error import ConfigError
 from flow.graph import Graph
-from flow.link import Run, Source, Tap
+from flow.jobs import Workers, run_all
+from flow.link import LinkError, Run, Source, Tap
 from flow.live.report import LiveReport
+from flow.ports import RunError
 from flow.replay import RunReport, replay
 from flow.stage import Stage
 from flow.subprocess_replay import can_use_subprocesses, replay_in_subprocesses
@@ -197,9 +205,9 @@ def replay_into(
     truth, digest = read_truth_file(recording), Digest() if hashed else None
     clock_warnings = clock_differences(graph, session.config_yaml)
     with RunFolder(folder, recording, request, graph, started_s) as run:
-        run_all = replay if single_process or not can_use_subprocesses() else replay_in_subprocesses
+        run_graph = replay if single_process or not can_use_subprocesses() else replay_in_subprocesses
         taps = run.taps if digest is None else (digest, *run.taps)
-        report = run_all(graph, truth.without_truth(session.records(progress=progress)), taps)
+        report = run_graph(graph, truth.without_truth(session.records(progress=progress)), taps)
         warnings, output_hash = [*session.warnings, *clock_warnings], None if digest is None else digest.hexdigest()
         return run.finish(report, output_hash, truth, warnings, parts=len(session.parts))
 
@@ -237,6 +245,65 @@ def holds_run(folder: Path, recording: Path, graph: Graph) -> bool:
         return is_new and (folder / CONFIG_FILE).read_text(encoding="utf-8") == graph.settings_yaml()
     except FileNotFoundError:
         return False
+
+
+@dataclass(frozen=True)
+class ReplayTask:
+    """One recording to replay."""
+
+    recording: Path
+    folder: Path
+    request: RunRequest
+    hashed: bool
+
+
+@dataclass(frozen=True)
+class ReplayOutcome:
+    """What became of a recording: the folder of its run, or why it has none."""
+
+    recording: Path
+    folder: Path
+    output_hash: str | None = None
+    kept: bool = False  # the run was there
+    failure: str = ""
+
+    def __str__(self) -> str:
+        if self.failure:
+            return f"{self.recording}: {self.failure}"
+        return f"{self.folder}: {'kept' if self.kept else 'made'}, output hash {self.output_hash or 'not computed'}"
+
+
+def replay_all(
+    recordings: Sequence[Path],
+    request: RunRequest,
+    out_dir: Path,
+    workers: Workers,
+    progress: Callable[[float, float], None],
+    *,
+    hashed: bool = True,
+) -> list[ReplayOutcome]:
+    """Replay into `out_dir/<recording>-<configuration>`. LinkError: two recordings have one name."""
+    twice = [name for name, count in Counter(path.stem for path in recordings).items() if count > 1]
+    if twice:
+        raise LinkError(f"several recordings are named {twice[0]}: their runs would share a folder; give each --out")
+    tasks = [ReplayTask(path, out_dir / f"{path.stem}-{request.config.stem}", request, hashed) for path in recordings]
+    return run_all(replay_one, tasks, workers, lambda shares: progress(sum(shares), len(tasks)))
+
+
+def replay_one(task: ReplayTask, report: Callable[[float], None]) -> ReplayOutcome:
+    """Replay one recording, unless its folder holds the run."""
+    try:
+        graph = task.request.graph(Session(task.recording).rig_yaml, f"{task.recording} (rig.yaml)")
+        if holds_run(task.folder, task.recording, graph):
+            summary = json.loads((task.folder / SUMMARY_FILE).read_text(encoding="utf-8"))
+            if summary["output_hash"] is not None or not task.hashed:
+                return ReplayOutcome(task.recording, task.folder, summary["output_hash"], kept=True)
+        result = replay_into(
+            task.folder, task.recording, task.request, lambda done, whole: report(done / whole), hashed=task.hashed
+        )
+    except (LinkError, ConfigError, RunError, OSError) as error:
+        return ReplayOutcome(task.recording, task.folder, failure=str(error))
+    return ReplayOutcome(task.recording, task.folder, result.output_hash)
 
 
 def _remarks(graph: Graph, report: RunReport) -> list[str]:

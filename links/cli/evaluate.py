@@ -95,7 +95,7 @@ def evaluate_runs(
     _check_installed()
     if tables := [path for path in runs if path.suffix == PARQUET]:
         others = (against, truth, report, out_dir, csv_file, parquet_file, tables_file, no_drone or None)
-        _show_tables(runs, tables, by or [], any(option is not None for option in others))
+        _show_tables(runs, tables, by or [], others)
         return
     if no_drone and truth is not None:
         raise LinkError("--no-drone and --truth contradict each other: give one of them")
@@ -105,16 +105,16 @@ def evaluate_runs(
     keys = [parse_by(text) for text in by or []]
     limits = EvaluationLimits(max_gap_s=max_gap_s, max_age_s=max_age_s, reach_m=reach_m)
     own, compared = evaluate_all(runs, against or [], truth, no_drone, limits, scheduler or jobs)
-    folder = out_dir or (report.parent if report else None)
-    files = Files(None if folder is None else folder / JSON_FILE, report, csv_file, parquet_file, tables_file)
+    numbers = out_dir / JSON_FILE if out_dir else report and report.with_name(JSON_FILE)
+    files = Files(numbers, report, csv_file, parquet_file, tables_file)
     compare_and_show(own, compared, keys, files)
     if any(e.findings for e in own):
         raise typer.Exit(EXIT_FAILED)
 
 
-def _show_tables(runs: list[Path], tables: list[Path], by: list[str], other_options: bool) -> None:
-    """Tables over the runs of Parquet files."""
-    if len(tables) < len(runs) or other_options:
+def _show_tables(runs: list[Path], tables: list[Path], by: list[str], others: tuple[object, ...]) -> None:
+    """Tables over the runs of Parquet files. `others`: values of other options, None where one is left out."""
+    if len(tables) < len(runs) or any(option is not None for option in others):
         raise LinkError(f"{tables[0]} is a table of evaluated runs: give tables alone, with --by and no other option")
     from links.cli.evaluate_output import show_tables
     from links.evaluation.groups import parse_by

@@ -47,6 +47,12 @@ Trust = Annotated[
         help="With --as-live: the recording is your own, so import its own stages and run its taps.",
     ),
 ]
+Hashed = Annotated[
+    bool, typer.Option("--hash/--no-hash", help="Compute the output hash, an eighth of the time without cameras.")
+]
+Expect = Annotated[
+    str | None, typer.Option("--expect", metavar="HASH", help="Exit code 1 unless the output hash is this one.")
+]
 SingleProcess = Annotated[
     bool,
     typer.Option(
@@ -132,14 +138,8 @@ def replay_recording(
     as_live: AsLive = False,
     trust: Trust = False,
     single_process: SingleProcess = False,
-    hashed: Annotated[
-        bool,
-        typer.Option("--hash/--no-hash", help="Compute the output hash, an eighth of the time without cameras."),
-    ] = True,
-    expect: Annotated[
-        str | None,
-        typer.Option("--expect", metavar="HASH", help="Exit code 1 unless the output hash is this one."),
-    ] = None,
+    hashed: Hashed = True,
+    expect: Expect = None,
     view: View = False,
     jobs: Jobs = 1,
     scheduler: Scheduler = None,

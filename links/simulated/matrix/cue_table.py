@@ -15,9 +15,7 @@ Source: ours.
 
 from __future__ import annotations
 
-import argparse
 import itertools
-import json
 import math
 import re
 import sys
@@ -28,11 +26,11 @@ from typing import Any
 
 import numpy as np
 
-from flow.jobs import Workers, run_all
 from flow.link import LinkError, Tap
 from flow.message import Message
 from links.runs.request import RunRequest
 from links.runs.shipped import shipped
+from links.simulated.matrix.flight_lines import flights_parser, flown
 from links.simulated.matrix.flights import CAMERA_HEIGHT_M, Cell
 from links.simulated.matrix.matrix import Conditions, cells, scenario_of
 from links.simulated.rig.closed_loop import ClosedLoop
@@ -85,11 +83,6 @@ class Flight:
     cell: Cell
     seed: int
     variant: str
-
-    @property
-    def key(self) -> tuple[str, int, str]:
-        """Identifies it in the file."""
-        return self.cell.name, self.seed, self.variant
 
 
 class AcceptanceTap(Tap):
@@ -235,36 +228,17 @@ def range_of(cell: str) -> str:
 
 def main() -> None:
     """The command."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path, help="folder for flights.jsonl and table.md")
-    parser.add_argument("--only", action="append", help="cells whose name matches; may be repeated")
-    parser.add_argument("--pairs", action="store_true", help="the small subset of `grd matrix --pairs`")
+    parser = flights_parser(__doc__)
     parser.add_argument("--variants", nargs="*", default=list(VARIANTS), choices=list(VARIANTS))
-    parser.add_argument("--seeds", type=int, default=1)
-    parser.add_argument("--first-seed", type=int, default=1)
-    parser.add_argument("--jobs", type=int, default=1)
     arguments = parser.parse_args()
-    arguments.folder.mkdir(parents=True, exist_ok=True)
-    file: Path = arguments.folder / "flights.jsonl"
-    rows = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()] if file.exists() else []
-    made = {(row["cell"], row["seed"], row["variant"]) for row in rows}
-    seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
-    selected = cells(arguments.only or ["*"], arguments.pairs)
     flights = [
         Flight(cell, seed, variant)
-        for cell in selected
-        for seed in seeds
+        for cell in cells(arguments.only or ["*"], arguments.pairs)
+        for seed in range(arguments.first_seed, arguments.first_seed + arguments.seeds)
         for variant in arguments.variants
-        if ("another" not in variant or cell.motion == "two") and (cell.name, seed, variant) not in made
+        if "another" not in variant or cell.motion == "two"
     ]
-    workers: Workers = arguments.jobs
-    for first in range(0, len(flights), arguments.jobs):
-        for row in run_all(fly, flights[first : first + arguments.jobs], workers, lambda _: None):
-            if row is not None:
-                rows.append(row)
-                with file.open("a", encoding="utf-8") as stream:
-                    stream.write(json.dumps(row) + "\n")
-    table = table_of(rows)
+    table = table_of(flown(arguments.folder, flights, fly, arguments.jobs))
     (arguments.folder / "table.md").write_text(table + "\n", encoding="utf-8")
     sys.stdout.write(table + "\n")
 

@@ -165,8 +165,13 @@ def test_an_ouster_without_beams_and_beams_of_another_sensor_are_errors():
     beams = ScenarioLidar.model_validate({"model": "OS0-64"}).beams
     with pytest.raises(ValueError, match="the OS1-32 has 32 lasers, not 64"):
         RigLidar(model="OS1-32", beams=beams)
-    with pytest.raises(LinkError, match="not the metadata of an Ouster"):
-        ouster_beams(json.dumps({"prod_line": "OS-1"}), "x.json")
+    for text, says in (
+        (json.dumps({"prod_line": "OS-1"}), "it has no 'beam_altitude_angles'"),
+        ("[]", "it is no JSON object"),
+        ('{"prod_line": ', "Expecting value"),
+    ):
+        with pytest.raises(LinkError, match=f"not the metadata of an Ouster sensor: {says}"):
+            ouster_beams(text, "x.json")
     with pytest.raises(LinkError, match="not the angle correction file"):
         hesai_beams("Channel,Elevation,Azimuth\n1,abc,0\n", "x.csv")
 

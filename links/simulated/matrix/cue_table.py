@@ -84,6 +84,11 @@ class Flight:
     seed: int
     variant: str
 
+    @property
+    def name(self) -> str:
+        """Of the cell."""
+        return self.cell.name
+
 
 class AcceptanceTap(Tap):
     """First fix and acceptances of a run, compared with the truth."""
@@ -181,7 +186,7 @@ def fly(flight: Flight, progress: Callable[[float], None]) -> dict[str, Any] | N
             break
     found = {"first_fix_s": tap.first_fix_s, "first_drone": tap.first_drone, "reported_s": tap.reported_s}
     return {
-        "cell": flight.cell.name,
+        "cell": flight.name,
         "seed": flight.seed,
         "variant": flight.variant,
         **found,

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 from flow.jobs import Workers, run_all
-from links.simulated.matrix.flights import Cell
 
 FILE = "flights.jsonl"
 Row = dict[str, Any]  # cell, seed, variant, and what a table needs
@@ -22,8 +21,8 @@ class Flight(Protocol):
     """One flight to simulate."""
 
     @property
-    def cell(self) -> Cell:
-        """What happens."""
+    def name(self) -> str:
+        """What happens: a cell, a scenario."""
         ...
 
     @property
@@ -49,7 +48,7 @@ def flown(
     workers: Workers = jobs
     rows = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()] if file.exists() else []
     made = {(row["cell"], row["seed"], row["variant"]) for row in rows}
-    new = [flight for flight in flights if (flight.cell.name, flight.seed, flight.variant) not in made]
+    new = [flight for flight in flights if (flight.name, flight.seed, flight.variant) not in made]
     for first in range(0, len(new), jobs):
         for row in run_all(fly, new[first : first + jobs], workers, lambda _: None):
             if row is not None:
@@ -59,12 +58,13 @@ def flown(
     return rows
 
 
-def flights_parser(description: str | None) -> argparse.ArgumentParser:
-    """The options that choose cells and seeds."""
+def flights_parser(description: str | None, cells: bool = True) -> argparse.ArgumentParser:
+    """The options that choose seeds and, with `cells`, cells of the matrix."""
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help=f"folder for {FILE} and table.md")
-    parser.add_argument("--only", action="append", help="cells whose name matches; may be repeated")
-    parser.add_argument("--pairs", action="store_true", help="the small subset of `grd matrix --pairs`")
+    if cells:
+        parser.add_argument("--only", action="append", help="cells whose name matches; may be repeated")
+        parser.add_argument("--pairs", action="store_true", help="the small subset of `grd matrix --pairs`")
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--first-seed", type=int, default=1)
     parser.add_argument("--jobs", type=int, default=1)

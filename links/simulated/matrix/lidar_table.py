@@ -50,6 +50,11 @@ class Flight:
     seed: int
     variant: LidarModel
 
+    @property
+    def name(self) -> str:
+        """Of the cell."""
+        return self.cell.name
+
 
 class FixTap(Tap):
     """Errors of the fixes of a run."""
@@ -98,7 +103,7 @@ def fly(flight: Flight, progress: Callable[[float], None]) -> dict[str, Any] | N
         if tap.first_fix_s is not None and now_s > tap.first_fix_s + AFTER_S:
             break
     return {
-        "cell": flight.cell.name,
+        "cell": flight.name,
         "seed": flight.seed,
         "variant": flight.variant,
         "first_fix_s": tap.first_fix_s,

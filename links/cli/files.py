@@ -13,7 +13,9 @@ import typer
 import yaml
 from pydantic import ValidationError
 
+from flow.config.tree import load_tree
 from flow.config.yaml_text import YamlTextError, yaml_values
+from flow.config_error import ConfigError
 from flow.link import LinkError
 from links.cli.console import EXIT_FAILED, check_new, err, out, progress_bar, report_errors, warn
 from stages.geometry.frames import LidarMount
@@ -119,7 +121,7 @@ def _lidar_of(file: Path) -> dict[str, Any]:
 
 
 def read_rig(file: Path) -> str:
-    """Text of a rig file, or of the `rig:` section of a configuration, as recordings store it.
+    """Text of a rig file, or of the `rig:` section of a configuration with its includes, as recordings store it.
 
     Raises LinkError when it is not a rig.
     """
@@ -127,12 +129,19 @@ def read_rig(file: Path) -> str:
         data = stream.read(MAX_RIG_BYTES + 1)
     try:
         tree = yaml_values(data) if len(data) <= MAX_RIG_BYTES else None
+        if isinstance(tree, dict) and "include" in tree:
+            tree = _with_includes(file)
     except YamlTextError as error:
         raise LinkError(f"{file} is no rig: {error}") from None
     rig = tree.get("rig", tree) if isinstance(tree, dict) else None
     if not isinstance(rig, dict) or "lidar" not in rig:
         raise LinkError(f"{file} is no rig: it needs 'lidar:' with 'mount:' as configs/rigs/standard.yaml has")
     mount = rig["lidar"].get("mount") if isinstance(rig["lidar"], dict) else None
+    if mount is None:
+        raise LinkError(
+            f"{file}: lidar.mount is missing: add `include: FILE` of the rig that has it, or the mount as "
+            "configs/rigs/standard.yaml has it"
+        )
     try:
         LidarMount.model_validate(mount)
     except ValidationError as errors:
@@ -140,6 +149,17 @@ def read_rig(file: Path) -> str:
         where = ".".join(str(part) for part in ("lidar", "mount", *first["loc"]))
         raise LinkError(f"{file}: {where}: {first['msg']}") from None
     return yaml.safe_dump(rig, sort_keys=False)
+
+
+def _with_includes(file: Path) -> dict[str, Any]:
+    """Values of a configuration over those that it includes. LinkError with the first error."""
+    try:
+        tree = load_tree(file)
+    except ConfigError as error:
+        raise LinkError(str(error.errors[0])) from None
+    if tree.errors:
+        raise LinkError(str(tree.errors[0]))
+    return tree.values
 
 
 @report_errors

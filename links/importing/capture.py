@@ -34,6 +34,8 @@ class Capture(ImportedFile):
         self._model = PacketModel(str(source), unit)
         self._report = PcapReport()
         self._other_ports: Counter[int] = Counter()  # data packets on other ports
+        self._not_data = 0  # packets on the LiDAR's port of another length,
+        self._first_of_them = b""  # and the first of them
 
     @property
     def _port(self) -> int:
@@ -88,6 +90,8 @@ class Capture(ImportedFile):
         if self._other_ports:
             ((port, count),) = self._other_ports.most_common(1)
             return f"{text}; {count} on port {port}: try --port {port}"
+        if form is not None and self._not_data:
+            return self._model.others(self._not_data, self._first_of_them, f"on UDP port {self._port}")
         if form is None and f"on UDP port {OUSTER_PORT}" in self._report.skipped:
             text += f"; UDP port {OUSTER_PORT} is an Ouster's, which needs its metadata: --rig METADATA.json"
         seen = [f"{count} packets {reason}" for reason, count in self._report.skipped.most_common(3)]
@@ -99,6 +103,9 @@ class Capture(ImportedFile):
             if datagram.port == self._port:
                 return LIDAR
             self._other_ports[datagram.port] += 1
+        elif datagram.port == self._port:
+            self._not_data += 1
+            self._first_of_them = self._first_of_them or payload
         elif len(payload) == POSITION_BYTES and datagram.port == POSITION_PORT:
             return POSITION
         return None

@@ -21,7 +21,14 @@ from links.ros.bag import BAG_METADATA
 SNIFF_BYTES = 4096
 RUN_FILES = ("summary.json", "run.log")
 _ROS1, _SQLITE, _ULOG, _DATAFLASH = b"#ROSBAG V2.0", b"SQLite format 3\0", b"ULog\x01\x12\x35", b"\xa3\x95\x80"
-_ZSTD = b"\x28\xb5\x2f\xfd"
+_COMPRESSED = {
+    b"\x28\xb5\x2f\xfd": "zstd -d",
+    b"\x1f\x8b": "gunzip -k",
+    b"BZh": "bunzip2 -k",
+    b"\xfd7zXZ\0": "unxz -k",
+    b"PK\x03\x04": "unzip",
+}
+"""First bytes of a file that is compressed as a whole, and the command that unpacks it."""
 IMPORTED = (
     "a pcap capture, a MAVLink log (.tlog), an ArduPilot log (.bin), a PX4 log (.ulg), "
     "a ROS bag (.bag, .db3, .mcap or their folder)"
@@ -45,13 +52,20 @@ def file_kind(path: Path) -> FileKind | None:
     if path.is_dir():
         if (path / BAG_METADATA).is_file():
             return FileKind.BAG
-        return FileKind.RUN if any((path / name).is_file() for name in RUN_FILES) else None
+        if any((path / name).is_file() for name in RUN_FILES):
+            return FileKind.RUN
+        for inside in sorted((*path.glob("*.db3"), *path.glob("*.mcap"), *path.glob("*.bag"))):
+            raise LinkError(
+                f"{path} has no {BAG_METADATA}, so that it is no ROS 2 bag: name the file {inside}, or write "
+                f"{BAG_METADATA} with `ros2 bag reindex {path}`"
+            )
+        return None
     with open_file(path) as stream:
         start = stream.read(SNIFF_BYTES)
-    if start.startswith(_ZSTD):
-        raise LinkError(
-            f"{path} is compressed as a whole: give its folder with {BAG_METADATA}, or unpack it first (zstd -d {path})"
-        )
+    for magic, unpack in _COMPRESSED.items():
+        if start.startswith(magic):
+            folder = f"give its folder with {BAG_METADATA}, or " if path.suffix == ".zstd" else ""
+            raise LinkError(f"{path} is compressed as a whole: {folder}unpack it first (`{unpack} {path}`)")
     if start.startswith(MCAP0_MAGIC):
         return FileKind.RECORDING if _mcap_profile(start) == PROFILE.encode() else FileKind.BAG
     for magic, kind in ((_ROS1, FileKind.BAG), (_SQLITE, FileKind.BAG), (_ULOG, FileKind.ULOG)):

@@ -76,13 +76,29 @@ class PacketModel:
             self.form = None if model is None else packet_format(model)
         return self.form or packet_format("VLP-16")
 
+    def others(self, count: int, payload: bytes, where: str) -> str:
+        """That `count` packets like `payload` are of another length than the known model's, and what to try."""
+        assert self.form is not None
+        profile = self.form.profile
+        model = recognised_model(payload)
+        are = f"are from a {model}" if model else f"have {len(payload)} bytes"
+        whose = f"the {profile.model} of the rig's metadata" if profile.model.startswith("OS") else f"a {profile.model}"
+        return (
+            f"{self._source}: {count} packets {where} {are}; those of {whose} have {self.form.packet_bytes} bytes: "
+            "give the LiDAR's own rig with --rig"
+        )
+
     def check(self, payload: bytes, where: str) -> None:
         """LinkError for a packet of another sensor; `where`: its place in the file."""
         form = self.form or packet_format("VLP-16")
-        if form.reject_reason(payload) in (PacketRejectReason.MODEL, PacketRejectReason.UNIT):
-            name = form.other_model(payload) or "an unknown model"
-            wanted = f", not a {form.profile.model}" if self.form else ", which grd does not know"
-            raise LinkError(
-                f"{self._source}: the packet {where} is from {name}{wanted}:"
-                " its beams have other elevations, so that every point would be wrong. Give its own rig with --rig"
-            )
+        reason = form.reject_reason(payload)
+        if reason not in (PacketRejectReason.MODEL, PacketRejectReason.UNIT):
+            return
+        text = f"{self._source}: the packet {where} is from {form.other_model(payload) or 'an unknown model'}"
+        if reason is PacketRejectReason.UNIT:
+            raise LinkError(f"{text}: every point would be wrong. Give this unit's metadata with --rig METADATA.json")
+        wanted = f", not a {form.profile.model}" if self.form else ", which grd does not know"
+        raise LinkError(
+            f"{text}{wanted}: its beams have other elevations, so that every point would be wrong. Give its own rig "
+            "with --rig"
+        )

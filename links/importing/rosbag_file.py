@@ -64,6 +64,7 @@ class RosbagFile(ImportedFile):
         self._clouds: CloudEncoder | None = None
         self._servo = ServoReader()
         self._skipped: Counter[str] = Counter()
+        self._not_data: tuple[bytes, str] | None = None  # the first LiDAR packet of another length, and its topic
         self._autopilot = AutopilotReader(self._skipped)
         self._time_ns = self._bag.start_ns
 
@@ -132,6 +133,9 @@ class RosbagFile(ImportedFile):
                 f"{self._source}: no cloud shows the order of its rings (it takes {MIN_FAR} points beyond "
                 f"{FAR_M:g} m): import the LiDAR's packets"
             )
+        if self._not_data is not None and self._model.form is not None:
+            payload, topic = self._not_data
+            return self._model.others(self._skipped[_no_data(topic, self._model.form)], payload, f"on {topic}")
         types = ", ".join(f"{topic.name} ({topic.type})" for topic in self._bag.topics if topic.messages)
         return f"{self._source}: nothing that grd can use: {types or 'the bag has no messages'}. `grd info` shows more"
 
@@ -156,7 +160,8 @@ class RosbagFile(ImportedFile):
                 self._model.check(payload, f"on {message.topic}")
                 payloads.append((stamp, payload))
             else:
-                self._skipped[f"packets on {message.topic} that are no {form.profile.model} data"] += 1
+                self._skipped[_no_data(message.topic, form)] += 1
+                self._not_data = self._not_data or (payload, message.topic)
         if self._model.form is None and payloads:
             raise LinkError(f"{self._source}: {message.topic}: packets of a LiDAR that grd does not know")
         by_recording = use.stamp == "arrival"
@@ -203,6 +208,11 @@ class RosbagFile(ImportedFile):
             f"{self._source}: {topics[0]} has packets of an Ouster, and the bag no metadata: give the sensor's with "
             "--rig METADATA.json"
         )
+
+
+def _no_data(topic: str, form: AnyFormat) -> str:
+    """Why packets are skipped that have not the model's length."""
+    return f"packets on {topic} that are no {form.profile.model} data"
 
 
 def _payloads(value: Any) -> Iterator[tuple[Any, bytes]]:

@@ -22,6 +22,8 @@ def ouster_beams(text: str, source: str) -> tuple[LidarModel, LidarBeams]:
     """Model and beams from an Ouster's metadata (JSON, as the sensor or its tools write it). LinkError: it is none."""
     try:
         tree: dict[str, Any] = json.loads(text)
+        if not isinstance(tree, dict):
+            raise TypeError("it is no JSON object")
         flat = {**tree, **{k: v for part in tree.values() if isinstance(part, dict) for k, v in part.items()}}
         lasers = len(flat["beam_altitude_angles"])
         model: Any = f"{flat['prod_line'].replace('OS-', 'OS')[:3]}-{lasers}"
@@ -39,7 +41,9 @@ def ouster_beams(text: str, source: str) -> tuple[LidarModel, LidarBeams]:
             packets=flat.get("udp_profile_lidar", "LEGACY"),
             serial=int(flat["prod_sn"]),
         )
-    except (KeyError, TypeError, AttributeError, ValueError) as error:
+    except KeyError as error:
+        raise LinkError(f"{source}: not the metadata of an Ouster sensor: it has no {error}") from None
+    except (TypeError, AttributeError, ValueError) as error:
         raise LinkError(f"{source}: not the metadata of an Ouster sensor: {str(error).splitlines()[0]}") from None
     return model, beams
 

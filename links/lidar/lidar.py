@@ -22,7 +22,7 @@ from pydantic import Field, model_validator
 from flow.counters import Counters
 from flow.link import LinkError, Record, Source, SourceSettings
 from links.lidar.decode import FiringRows, compile_kernels
-from links.lidar.formats import AnyFormat, packet_format
+from links.lidar.formats import AnyFormat, packet_format, recognised_model
 from links.lidar.lidar_clock import ClockMode, LidarClock
 from links.lidar.position import PpsMonitor
 from links.lidar.reject_reason import PacketRejectReason
@@ -216,6 +216,8 @@ class PacketStream:
         model = self._form.profile.model
         if reason is not PacketRejectReason.POSITION and (self.decoded == 0 or stuck):
             other = self._form.other_model(data)
+            if other is None and reason is PacketRejectReason.LENGTH:
+                other = recognised_model(data)
             if other is not None:
                 raise LinkError(
                     f"{self._topic}: these packets come from a {other}, the rig's LiDAR is a {model}: set rig.lidar, "

@@ -35,11 +35,15 @@ from links.recording.index import FileIndex, read_index
 MAX_OVERLAP_BYTES = 512 * 2**20  # chunks that overlap in time are in memory together
 _ENTRY_BYTES = 256  # memory of a record in addition to its data
 _IMPORTABLE = {
-    b"\xd4\xc3\xb2\xa1": "pcap capture",
-    b"\xa1\xb2\xc3\xd4": "pcap capture",
-    b"\x4d\x3c\xb2\xa1": "pcap capture",
-    b"\xa1\xb2\x3c\x4d": "pcap capture",
-    b"\x0a\x0d\x0d\x0a": "pcapng capture",
+    b"\xd4\xc3\xb2\xa1": "a pcap capture",
+    b"\xa1\xb2\xc3\xd4": "a pcap capture",
+    b"\x4d\x3c\xb2\xa1": "a pcap capture",
+    b"\xa1\xb2\x3c\x4d": "a pcap capture",
+    b"\x0a\x0d\x0d\x0a": "a pcapng capture",
+    b"#ROS": "a ROS bag",
+    b"SQLi": "a ROS bag",
+    b"ULog": "a PX4 log",
+    b"\xa3\x95\x80\x80": "an ArduPilot log",
 }
 
 _Entry = tuple[int, int, Record]  # arrival_ns, sequence, record
@@ -237,7 +241,7 @@ def check_magic(path: Path, magic: bytes) -> None:
         raise LinkError(f"{path} ends after {len(magic)} bytes: the recording was cut off before anything was written")
     kind = _IMPORTABLE.get(magic[:4])
     if kind is None and path.suffix == ".tlog":
-        kind = "MAVLink telemetry log"
+        kind = "a MAVLink telemetry log"
     if kind is not None:
-        raise LinkError(f"{path} is a {kind}: make a recording of it first with `grd import {path}`")
+        raise LinkError(f"{path} is {kind}: make a recording of it first with `grd import {path}`")
     raise LinkError(f"{path} is no recording: it starts with {magic!r}, not as an MCAP file does")

@@ -37,6 +37,11 @@ MAX_TURN_ERROR_RAD = math.radians(1.0)  # median of the columns' azimuths agains
 MAX_SPAN_NS = 1_000_000_000  # of the times in one cloud
 MAX_GAP_NS = 60_000_000  # between two clouds; longer: packets are missing
 MAX_TIME_S = 4e9  # of damaged times; in ns it fits 64 bits
+RETURNS = 3  # of a pulse, at most
+_NO_TIMES = (
+    ": the drone would be smeared over a turn of the sensor. Record the packets, or set the driver to publish a time "
+    "per point"
+)
 _TYPES = {1: "i1", 2: "u1", 3: "<i2", 4: "<u2", 5: "<i4", 6: "<u4", 7: "<f4", 8: "<f8"}
 
 
@@ -71,6 +76,8 @@ class CloudEncoder:
             return []
         xyz, ring, at_ns, shade = points
         span_ns = int(at_ns[-1]) - int(at_ns[0])
+        if span_ns == 0 and len(at_ns) > RETURNS * self._profile.lasers:
+            raise LinkError(f"{self._topic}: all points of a cloud have the same time{_NO_TIMES}")
         if span_ns > MAX_SPAN_NS:
             raise LinkError(
                 f"{self._topic}: the times of the points in one cloud span {span_ns * 1e-9:.1f} s: times are damaged, "
@@ -104,12 +111,13 @@ class CloudEncoder:
         fields = {str(field.name): field for field in cloud.fields}
         ring_name, time_name = (next((n for n in names if n in fields), None) for names in (RINGS, TIMES))
         if time_name is None:
-            raise LinkError(
-                f"{self._topic}: its points have no time (fields: {', '.join(fields)}): the drone would be smeared "
-                "over a turn of the sensor. Record the packets, or set the driver to publish a time per point"
-            )
+            raise LinkError(f"{self._topic}: its points have no time (fields: {', '.join(fields)}){_NO_TIMES}")
         if ring_name is None or not {"x", "y", "z"} <= fields.keys():
-            raise LinkError(f"{self._topic}: its points have no x, y, z and ring (fields: {', '.join(fields)})")
+            missing = [n for n in ("x", "y", "z", *(["ring"] if ring_name is None else [])) if n not in fields]
+            raise LinkError(
+                f"{self._topic}: its points have no {', '.join(missing)} (fields: {', '.join(fields)}), so that their "
+                "beams are unknown. Record the packets, or set the driver to publish the ring of each point"
+            )
         shade_name = next((n for n in REFLECTIVITIES if n in fields), None)
         names = ["x", "y", "z", ring_name, time_name, *([shade_name] if shade_name else [])]
         bad = [n for n in names if fields[n].count != 1 or fields[n].datatype not in _TYPES]

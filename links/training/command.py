@@ -64,8 +64,7 @@ def train_detector(
     if ablation and not held_out:
         raise LinkError("--ablation needs --held-out: the models without a group are scored on these runs")
 
-    workers = scheduler or jobs
-    rows, lidar_model = read_candidates(runs, workers=workers), lidar_model_of(runs)
+    rows, lidar_model = read_candidates(runs, workers=scheduler or jobs), lidar_model_of(runs)
     folders = [run for folder in held_out or [] for run in sorted(folder.iterdir()) if run.is_dir()]
     trained: dict[str, Any] = {
         "command": _command(runs, out_file, held_out or [], left_out or [], start_file, ablation),
@@ -79,7 +78,7 @@ def train_detector(
     model = train(rows, trained, left_out or [], lidar_model, start)
     _warn_of_end(trained["strength"])
     if folders:
-        unseen = read_candidates(folders, workers=workers)
+        unseen = read_candidates(folders, workers=scheduler or jobs)
         trained["held_out"] = _compared(unseen, predicted(model, unseen))
         for group in ("nothing", *GROUPS) if ablation else ():
             names = [feature.name for feature in FEATURES if feature.group == group]

@@ -34,6 +34,8 @@ class CueBias:
         self.mean_m: Array64 = np.zeros(len(stationary_m2))
         self.covariance_m2: Array64 = stationary_m2.copy()
         self.trusted = trusted
+        self.confirmed = False
+        """Whether the cue has agreed with the LiDAR for AGREES_NS, and has not contradicted since."""
         self._stamp_ns: int | None = None
         self._agrees, self._in_a_row, self._since_ns = True, 0, 0  # the newest residuals that agree, or that do not
 
@@ -58,7 +60,7 @@ class CueBias:
         self._in_a_row += 1
         enough_ns = AGREES_NS if agrees else CONTRADICTS_NS
         if self._in_a_row >= LEAST and stamp_ns - self._since_ns >= enough_ns:
-            self.trusted = agrees
+            self.trusted = self.confirmed = agrees
         if not agrees:
             return
         gain = self.covariance_m2 @ np.linalg.inv(self.covariance_m2 + noise_m2)

@@ -5,8 +5,13 @@
 z: measurement, h(x): the same of the candidate's position x at that time, b and S: bias and covariance of the cue and
 of the candidate, p_0: density of z for an object anywhere within the search range R, 3 / (2 pi R^3) for a position and
 1 / R for each scalar, e: probability that a cue is of another object. Of the newest three measurements of a cue the
-median counts: a single reflection changes nothing. The caps are the safety: with the largest sum a
-candidate must reach 72 % by the LiDAR alone. A cue that contradicts the candidate removes what the others add.
+median counts: a single reflection changes nothing. A cue that contradicts the candidate removes what the others add.
+
+A wrong cue can be exactly where a lamp is: its position shows nothing. Only what a cue of `shown` adds may have a
+candidate accepted: one that has agreed with the drone before (`bias.py`), or that moves as the candidate does. With d0
+the change of the residual to an object that stands where the candidate is, d1 that to the candidate, S0 and S1 their
+covariances:  d0' S0^-1 d0 > chi2(99.9 %),  d1' S1^-1 d1 < chi2(99 %),  and the sigma of S1 below half of d0.
+Even then the caps hold: with the largest sum a candidate must reach 72 % by the LiDAR alone.
 
 A cue that contradicts the drone found by the LiDAR alone is not used and is reported (`bias.py`).
 
@@ -19,6 +24,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from statistics import median_low
 from typing import NamedTuple
@@ -27,7 +33,7 @@ import numpy as np
 from pydantic import Field
 
 from flow.stage import StrictModel
-from stages.cues.bias import CueBias
+from stages.cues.bias import CHI2_999, CueBias
 from stages.geometry.frames import Array64
 from stages.geometry.trajectory import VehicleTrajectory
 from stages.messages import CueKind, CueState, DroneCue
@@ -36,6 +42,9 @@ from stages.sums import sum_in_order
 NEWEST = 3  # measurements of a cue that count
 OLDEST_NS = 1_500_000_000
 CONTRADICTS_NATS = -1.0  # below: the cue contradicts the candidate
+CHI2_99 = {1: 6.63, 2: 9.21, 3: 11.34}  # 99 % quantiles by degrees of freedom
+MOVED_NS = 1_500_000_000  # longest span over which motions are compared
+AFTER_PATH_NS = 100_000_000  # from the newest observation: it has moved little since
 
 
 class CueWeights(StrictModel):
@@ -62,10 +71,36 @@ class ObjectState(NamedTuple):
     p: tuple[float, float, float]  # variances: position, position-velocity, velocity
 
 
+class CueNats(NamedTuple):
+    """What all cues add to the log-odds that an object is the drone."""
+
+    total: float
+    of_shown: float  # without what cues add that have not shown that they are of it
+    remark: str  # for people; empty: no cue
+
+
+NO_CUE = CueNats(0.0, 0.0, "")
+
+
+class ObjectPath(NamedTuple):
+    """Where an object was observed, in frame map; at least once."""
+
+    stamps_ns: Sequence[int]
+    xyz_m: Sequence[Array64]
+    sigma_m: float  # of each, an axis
+
+    def at(self, stamp_ns: int) -> Array64:
+        """Position (3,) at a time, between two observations or at the nearest."""
+        xyz_m = np.array(self.xyz_m)
+        since = np.array(self.stamps_ns, dtype=np.int64) - self.stamps_ns[0]
+        return np.array([np.interp(stamp_ns - self.stamps_ns[0], since, xyz_m[:, k]) for k in range(3)])
+
+
 @dataclass(slots=True, eq=False)
 class _Cue:
     bias: CueBias
     newest: deque[DroneCue] = field(default_factory=lambda: deque[DroneCue](maxlen=NEWEST))
+    before: deque[DroneCue] = field(default_factory=lambda: deque[DroneCue](maxlen=64))  # of MOVED_NS
 
 
 class CueEvidence:
@@ -83,6 +118,9 @@ class CueEvidence:
             trusted = known is None or known.bias.trusted
             known = self._cues[cue.source] = _Cue(CueBias(slow_covariance_m2(cue), trusted))
         known.newest.append(cue)
+        known.before.append(cue)
+        while cue.stamp_ns - known.before[0].stamp_ns > MOVED_NS:
+            known.before.popleft()
         bias = known.bias
         bias.predict(cue.stamp_ns, slow_covariance_m2(cue), cue.bias_time_s)
         offset_m = math.nan
@@ -99,20 +137,32 @@ class CueEvidence:
             if cue.newest:
                 cue.bias = CueBias(slow_covariance_m2(cue.newest[-1]), cue.bias.trusted)
                 cue.newest.clear()
+                cue.before.clear()
 
-    def nats(self, c: ObjectState, trail: VehicleTrajectory, now_ns: int) -> tuple[float, str]:
-        """What all cues add to the log-odds that an object is the drone, and the remark for people."""
+    def shown(self, path: ObjectPath, trail: VehicleTrajectory) -> set[str]:
+        """The cues that may have this object accepted: confirmed by the LiDAR before, or moving as it does."""
+        return {
+            source
+            for source, cue in self._cues.items()
+            if cue.bias.trusted and (cue.bias.confirmed or moves_as(path, cue.before, trail))
+        }
+
+    def nats(self, c: ObjectState, trail: VehicleTrajectory, now_ns: int, shown: Collection[str] = ()) -> CueNats:
+        """What all cues add to the log-odds that an object is the drone; `shown`: see there."""
         by_source: dict[str, float] = {}
         for source, cue in self._cues.items():
             recent = [z for z in cue.newest if now_ns - z.stamp_ns < OLDEST_NS]
             if recent and cue.bias.trusted:
                 by_source[source] = median_low([self._nats(z, cue.bias, trail, c) for z in recent])
         if not by_source:
-            return 0.0, ""
-        total = min(sum_in_order(by_source.values()), self._weights.max_sum)
-        if min(by_source.values()) < CONTRADICTS_NATS:
-            total = min(total, min(by_source.values()))
-        return total, ", ".join(f"{source} {nats:+.1f}" for source, nats in by_source.items())
+            return NO_CUE
+        of_shown = {source: nats if source in shown else min(nats, 0.0) for source, nats in by_source.items()}
+        remark = ", ".join(f"{source} {nats:+.1f}" for source, nats in by_source.items())
+        return CueNats(self._sum(by_source), self._sum(of_shown), remark)
+
+    def _sum(self, by_source: dict[str, float]) -> float:
+        total, lowest = min(sum_in_order(by_source.values()), self._weights.max_sum), min(by_source.values())
+        return min(total, lowest) if lowest < CONTRADICTS_NATS else total
 
     def _nats(self, cue: DroneCue, bias: CueBias, trail: VehicleTrajectory, c: ObjectState) -> float:
         residual_m, noise_m2 = residual_of(cue, trail, c)
@@ -122,6 +172,38 @@ class CueEvidence:
         e = self._weights.outlier_probability
         ratio = math.exp(min(log_density - log_uniform + n * math.log(self._search_m), 50.0))
         return min(math.log((1.0 - e) * ratio + e), self._weights.cap(cue.source))
+
+
+def moves_as(path: ObjectPath, cues: Sequence[DroneCue], trail: VehicleTrajectory) -> bool:
+    """Whether a cue moves as the object does, and as none that stands; by two measurements while it was observed."""
+    known = [cue for cue in cues if path.stamps_ns[0] <= cue.stamp_ns <= path.stamps_ns[-1] + AFTER_PATH_NS]
+    if len(known) < 2:
+        return False
+    now, here_m = known[-1], path.at(known[-1].stamp_ns)
+    at_end = _residual_m(now, trail, here_m)
+    for before in known[:-1]:
+        if before.kind is not now.kind:
+            continue
+        d0 = at_end - _residual_m(before, trail, here_m)
+        d1 = at_end - _residual_m(before, trail, path.at(before.stamp_ns))
+        span_s = (now.stamp_ns - before.stamp_ns) * 1e-9
+        S0 = now.covariance_m2 + before.covariance_m2 + now.bias_covariance_m2 * (2.0 * span_s / now.bias_time_s)
+        S1 = S0 + 2.0 * path.sigma_m**2 * np.eye(len(d0))
+        if (
+            _distance2(d0, S0) > CHI2_999[len(d0)]
+            and _distance2(d1, S1) < CHI2_99[len(d0)]
+            and math.sqrt(float(np.linalg.eigvalsh(S1)[-1])) < 0.5 * float(np.linalg.norm(d0))
+        ):
+            return True
+    return False
+
+
+def _residual_m(cue: DroneCue, trail: VehicleTrajectory, xyz_m: Array64) -> Array64:
+    return residual_of(cue, trail, ObjectState(cue.stamp_ns, xyz_m, np.zeros(3), (0.0, 0.0, 0.0)))[0]
+
+
+def _distance2(d: Array64, S: Array64) -> float:
+    return float(d @ np.linalg.solve(S, d))
 
 
 def residual_of(cue: DroneCue, trail: VehicleTrajectory, c: ObjectState) -> tuple[Array64, Array64]:

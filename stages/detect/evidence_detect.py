@@ -25,11 +25,12 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from flow.stage import Settings, Stage
-from stages.cues.evidence import CueEvidence, CueWeights, ObjectState
+from stages.cues.evidence import CueEvidence, CueWeights, ObjectPath, ObjectState
 from stages.detect.candidate import SAME_PASS_NS, START_SPEED_MPS, STATIC_M, Alternative, Candidate, Observation
 from stages.detect.candidate_messages import candidate_log, candidates_message, detections_message, log_odds_of
 from stages.detect.candidate_table import CandidateTable, positions_of
 from stages.detect.classifier import ClassifierWeights, classify
+from stages.detect.flight import scatter_m
 from stages.detect.isolation import LargeObjectMap
 from stages.detect.observations import ObservationFinder, ObservationLimits, Slice
 from stages.detect.reacquire import reacquired_candidate, without_duplicates
@@ -299,9 +300,11 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
     def _add_cues(self, now: _State, c: Candidate) -> None:
         """Add the evidence of cues to the log-odds: their lowest of the last seconds, so that a short match is none.
 
-        A cue is of one object: it adds nothing to others while it matches an accepted candidate.
+        A cue is of one object: it adds nothing to others while it matches an accepted candidate. What cues add that
+        have not shown that they are of this candidate ends below the threshold of acceptance.
         """
-        nats, remark = now.cues.nats(_object(c), now.trail, c.stamp_ns)
+        state = _object(c)
+        nats, of_shown, remark = now.cues.nats(state, now.trail, c.stamp_ns, c.cues_shown)
         if not remark:
             c.cue_nats = None
             return
@@ -311,8 +314,11 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
             since_s = (c.stamp_ns - c.cue_ns) * 1e-9
             nats = min(nats, c.cue_nats + self.settings.cues.recovery_nats_per_s * since_s)
         c.cue_nats, c.cue_ns = nats, c.stamp_ns
-        if c.scan_passes < CUE_PASSES:
-            nats = min(nats, max(log_odds_of(self.settings.accept_probability) - CUE_MARGIN_NATS - c.log_odds, 0.0))
+        ceiling = max(log_odds_of(self.settings.accept_probability) - CUE_MARGIN_NATS - c.log_odds, 0.0)
+        if nats > max(of_shown, ceiling) and c.scan_passes >= CUE_PASSES:
+            c.cues_shown |= now.cues.shown(ObjectPath(c.path_ns, c.path_m, scatter_m(c.range_m)), now.trail)
+            of_shown = now.cues.nats(state, now.trail, c.stamp_ns, c.cues_shown).of_shown
+        nats = min(nats, max(of_shown, ceiling) if c.scan_passes >= CUE_PASSES else ceiling)
         observed = min(c.log_odds, log_odds_of(self.settings.follow_up_probability))
         c.log_odds = max(c.log_odds + nats, observed)  # a wrong cue does not end the observation of the drone
         c.reason += f"; cues {nats:+.1f} ({remark})"

@@ -1,10 +1,12 @@
 """Table of the first fix with and without each cue, and of false acceptances with wrong cues.
 
     python -m links.simulated.matrix.cue_table OUT --only 'campus-20m-hover-parked' --seeds 2
+    python -m links.simulated.matrix.cue_table OUT --pairs --only '*-20m-[!r]*' --only '*-30m-*'
 
 Each flight is simulated in closed loop with configs/cues.yaml, without the fusion, up to `AFTER_S` after its first fix.
 First fix: the first DroneFix within NEAR_M of the drone. False acceptance: a candidate that the detector accepts
-farther than NEAR_M from every drone. Exposed (flights without cues): a candidate that is no drone, not accepted, but
+farther than NEAR_M from every drone; `by_cues` when it would not have been accepted without what the cues add.
+Exposed (flights without cues): a candidate that is no drone, not accepted, but
 so probable that a cue with the largest sum, placed exactly on it, would have it accepted. OUT/flights.jsonl has a line
 for each flight; flights in it are not repeated.
 
@@ -13,10 +15,9 @@ Source: ours.
 
 from __future__ import annotations
 
-import argparse
 import itertools
-import json
 import math
+import re
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -25,11 +26,11 @@ from typing import Any
 
 import numpy as np
 
-from flow.jobs import Workers, run_all
 from flow.link import LinkError, Tap
 from flow.message import Message
 from links.runs.request import RunRequest
 from links.runs.shipped import shipped
+from links.simulated.matrix.flight_lines import flights_parser, flown
 from links.simulated.matrix.flights import CAMERA_HEIGHT_M, Cell
 from links.simulated.matrix.matrix import Conditions, cells, scenario_of
 from links.simulated.rig.closed_loop import ClosedLoop
@@ -43,6 +44,7 @@ from stages.messages import CandidateEvidence, CandidateLog, CueState, Detection
 NEAR_M = 1.0  # as `grd evaluate`
 ACCEPT_NATS = log_odds_of(0.95)  # `accept_probability` of the detector
 AFTER_S = 2.0
+CUES_ADD = re.compile(r"; cues ([+-][0-9.]+)")  # in the reason of a candidate
 GNSS: dict[str, Any] = {"drone": {}, "vehicle": {"heading_sigma_deg": 2.0}}
 NO_HEADING: dict[str, Any] = {"drone": {}, "vehicle": {}}
 RANGING: dict[str, Any] = {"ranging": {}}
@@ -83,9 +85,9 @@ class Flight:
     variant: str
 
     @property
-    def key(self) -> tuple[str, int, str]:
-        """Identifies it in the file."""
-        return self.cell.name, self.seed, self.variant
+    def name(self) -> str:
+        """Of the cell."""
+        return self.cell.name
 
 
 class AcceptanceTap(Tap):
@@ -148,8 +150,21 @@ class AcceptanceTap(Tap):
             distances_m = self.distances_m(seen_ns, message.xyz_vehicle_m[i])
             is_false = not distances_m or min(distances_m) > NEAR_M
             if is_false and (number, True) not in self.accepted:
-                self.false.append({"s": self._seconds(seen_ns), "m": distances_m, "why": message.reasons[i]})
+                self.false.append(
+                    {
+                        "s": self._seconds(seen_ns),
+                        "m": distances_m,
+                        "by_cues": by_cues(float(evidence.log_odds[i]), message.reasons[i]),
+                        "why": message.reasons[i],
+                    }
+                )
             self.accepted.add((number, is_false))
+
+
+def by_cues(log_odds: float, reason: str) -> bool:
+    """Whether an accepted candidate is below the threshold without what the cues add, by its reason."""
+    cues = CUES_ADD.search(reason)
+    return cues is not None and log_odds - float(cues[1]) < ACCEPT_NATS
 
 
 def fly(flight: Flight, progress: Callable[[float], None]) -> dict[str, Any] | None:
@@ -171,7 +186,7 @@ def fly(flight: Flight, progress: Callable[[float], None]) -> dict[str, Any] | N
             break
     found = {"first_fix_s": tap.first_fix_s, "first_drone": tap.first_drone, "reported_s": tap.reported_s}
     return {
-        "cell": flight.cell.name,
+        "cell": flight.name,
         "seed": flight.seed,
         "variant": flight.variant,
         **found,
@@ -182,7 +197,7 @@ def fly(flight: Flight, progress: Callable[[float], None]) -> dict[str, Any] | N
 
 def table_of(rows: Sequence[dict[str, Any]]) -> str:
     """Markdown: by range and variant, flights, median and slowest first fix, false acceptances, wrong first drones."""
-    lines = ["| range | cues | flights | found | median first fix [s] | slowest [s] | false acceptances | reported |"]
+    lines = ["| range | cues | flights | found | median first fix [s] | slowest [s] | false (by cues) | reported |"]
     lines.append("| --- | --- | --- | --- | --- | --- | --- | --- |")
     by_range = sorted({range_of(row["cell"]) for row in rows}, key=int)
     for range_m, variant in itertools.product(by_range, VARIANTS):
@@ -190,11 +205,13 @@ def table_of(rows: Sequence[dict[str, Any]]) -> str:
         if not of:
             continue
         first_s = sorted(row["first_fix_s"] if row["first_fix_s"] is not None else math.inf for row in of)
-        found, false = sum(map(math.isfinite, first_s)), sum(len(row["false"]) for row in of)
+        false = list(itertools.chain.from_iterable(row["false"] for row in of))
+        by = sum(one["by_cues"] for one in false)
+        found = sum(map(math.isfinite, first_s))
         reported = sum(row["reported_s"] is not None for row in of)
         median_s, slowest_s = first_s[(len(first_s) - 1) // 2], first_s[-1]
         times = f"{found} | {median_s:.2f} | {slowest_s:.2f}"
-        lines.append(f"| {range_m} m | {variant} | {len(of)} | {times} | {false} | {reported} |")
+        lines.append(f"| {range_m} m | {variant} | {len(of)} | {times} | {len(false)} ({by}) | {reported} |")
     exposed = [row["exposed"] for row in rows if row["variant"] == "none"]
     lines.append(
         f"\nExposed to a cue exactly on them: {sum(exposed)} candidates in {len(exposed)} flights without cues."
@@ -216,35 +233,17 @@ def range_of(cell: str) -> str:
 
 def main() -> None:
     """The command."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path, help="folder for flights.jsonl and table.md")
-    parser.add_argument("--only", action="append", help="cells whose name matches; may be repeated")
+    parser = flights_parser(__doc__)
     parser.add_argument("--variants", nargs="*", default=list(VARIANTS), choices=list(VARIANTS))
-    parser.add_argument("--seeds", type=int, default=1)
-    parser.add_argument("--first-seed", type=int, default=1)
-    parser.add_argument("--jobs", type=int, default=1)
     arguments = parser.parse_args()
-    arguments.folder.mkdir(parents=True, exist_ok=True)
-    file: Path = arguments.folder / "flights.jsonl"
-    rows = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()] if file.exists() else []
-    made = {(row["cell"], row["seed"], row["variant"]) for row in rows}
-    seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
-    selected = cells(arguments.only or ["*"])
     flights = [
         Flight(cell, seed, variant)
-        for cell in selected
-        for seed in seeds
+        for cell in cells(arguments.only or ["*"], arguments.pairs)
+        for seed in range(arguments.first_seed, arguments.first_seed + arguments.seeds)
         for variant in arguments.variants
-        if ("another" not in variant or cell.motion == "two") and (cell.name, seed, variant) not in made
+        if "another" not in variant or cell.motion == "two"
     ]
-    workers: Workers = arguments.jobs
-    for first in range(0, len(flights), arguments.jobs):
-        for row in run_all(fly, flights[first : first + arguments.jobs], workers, lambda _: None):
-            if row is not None:
-                rows.append(row)
-                with file.open("a", encoding="utf-8") as stream:
-                    stream.write(json.dumps(row) + "\n")
-    table = table_of(rows)
+    table = table_of(flown(arguments.folder, flights, fly, arguments.jobs))
     (arguments.folder / "table.md").write_text(table + "\n", encoding="utf-8")
     sys.stdout.write(table + "\n")
 

@@ -9,7 +9,8 @@ with the surface's normal n and the time dt between both measurements. w is esti
 direction of travel (|n . x| > FACING), by Huber's weights, in SECTORS sectors of the revolution. Most of the sectors
 with an estimate, and at least two, must agree: a vehicle that passes is only in some of them.
 
-Nothing is known on a road between walls parallel to it, in an open field, and among trees.
+Nothing is known on a road between walls parallel to it, in an open field, and among trees; nor with another LiDAR than
+one of 16 beams 2 deg apart (VLP-16, XT16).
 
 Source: ours; Huber weights: P. J. Huber, "Robust Estimation of a Location Parameter", 1964.
 """
@@ -25,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.geometry.frames import Array64
-from stages.kernels.odometry.scan_residuals import LASERS, scan_residuals
+from stages.kernels.odometry.scan_residuals import LASERS, LOWEST_DEG, SPACING_DEG, scan_residuals
 from stages.messages import SweptPulses
 
 EVERY = 4  # of the firings
@@ -39,6 +40,8 @@ INLIER_M, INLIERS = 0.06, 0.7  # share of the rows that must fit
 ROW_SIGMA_M = 0.02  # smallest sigma of a distance
 SURFACE_MPS = 0.1  # error of the estimate by surfaces that are no planes, one sigma
 AGREE_SIGMAS, AGREE_MPS, AGREE_SHARE = 3.0, 0.2, 0.7  # difference of a sector from the median; share that agrees
+FAN_RAD = math.radians(-2.0 * LOWEST_DEG)  # between the outermost beams
+SAME_FAN_RAD = math.radians(0.5 * SPACING_DEG)
 KEPT_NS = 500_000_000  # of slices and revolutions that wait for a pose
 
 
@@ -101,6 +104,8 @@ class StaticScan:
         if self._slices and pulses.stamp_ns - self._slices[-1].pulses.stamp_ns > KEPT_NS:
             self.restart()
         directions = pulses.direction_vehicle.reshape(firings, LASERS, 3)
+        if int(pulses.laser.max()) != LASERS - 1 or abs(_fan_rad(directions[0]) - FAN_RAD) > SAME_FAN_RAD:
+            return None
         begin, end = (directions[at].astype(np.float64).mean(axis=0) for at in (0, -1))
         cosine = float(begin @ end / (np.linalg.norm(begin) * np.linalg.norm(end)))
         self._turned_rad += math.acos(min(max(cosine, -1.0), 1.0)) * firings / (firings - 1)
@@ -112,6 +117,11 @@ class StaticScan:
         self._turned_rad = 0.0
         before, self._before = self._before, revolution
         return None if before is None else velocity_error(before, revolution)
+
+
+def _fan_rad(directions: NDArray[np.float32]) -> float:
+    """Largest angle between two of the beams (n, 3)."""
+    return math.acos(min(max(float((directions @ directions.T).min()), -1.0), 1.0))
 
 
 def _in_map(posed: _Posed) -> tuple[Array64, Array64]:

@@ -271,11 +271,15 @@ def test_an_import_takes_the_rig_of_a_file_or_of_a_configuration(grd, tmp_path):
         ("a.yaml", "lidar: {mount: {turn: true}}", "a.yaml: lidar.mount.turn: Extra inputs are not permitted"),
         ("b.yaml", "- 1", "b.yaml is no rig: it needs 'lidar:'"),
         ("c.yaml", "a: [", "c.yaml is no rig: "),
+        ("d.yaml", "rig: {lidar: {model: XT16}}", "d.yaml: lidar.mount is missing: add `include: FILE`"),
+        ("e.yaml", "include: none.yaml\nrig: {lidar: {model: XT16}}", "e.yaml:1: include: no such file 'none.yaml'"),
     ]:
         (tmp_path / name).write_text(text)
         assert words in grd("import", capture, "--rig", name, code=2)
     rig = yaml.safe_load(read_rig(ROOT / "configs" / "rigs" / "standard.yaml"))
     assert rig["lidar"]["mount"]["T_turntable_lidar"]["rpy_deg"] == [90.0, 0.0, 0.0]
+    with_include = yaml.safe_load(read_rig(ROOT / "configs" / "rigs" / "xt32.yaml"))
+    assert with_include == {**rig, "lidar": {**rig["lidar"], "model": "XT32"}}
 
 
 def test_view_opens_the_newest_run_or_the_one_in_a_folder(grd, tmp_path, monkeypatch):

@@ -168,6 +168,15 @@ def test_another_model_is_rejected_by_name_and_leaves_no_file(tmp_path: Path, pr
     assert not (tmp_path / "drive.mcap").exists()
 
 
+def test_packets_of_another_length_than_the_rigs_models_are_named(tmp_path: Path):
+    content = pcap([ethernet(udp(p)) for p in PACKETS])
+    with pytest.raises(
+        LinkError, match=r"4 packets on UDP port 2368 are from a VLP-16; those of a XT16 have 568 bytes: give"
+    ):
+        run(tmp_path, content, rig_yaml="lidar: {model: XT16, mount: {turns: false}}")
+    assert not (tmp_path / "drive.mcap").exists()
+
+
 # ---- what is attached
 
 

@@ -27,6 +27,7 @@ from flow.message import array_fields, check_arrays
 from flow.replay import replay
 from links.lidar import Lidar
 from links.lidar.reject_reason import PacketRejectReason
+from stages.geometry.rig_lidar import RigLidar
 
 SWEEP = """\
 stages:
@@ -178,6 +179,12 @@ def test_dual_return_blocks_of_one_pulse_share_their_azimuth():
 def test_another_model_is_rejected_by_name_at_its_first_packet(product, name):
     with pytest.raises(LinkError, match=rf"Velodyne {name}.*the rig's LiDAR is a VLP-16"):
         Lidar(slice_ms=ONE_PACKET_MS).decode(record(packet(product=product)))
+
+
+def test_packets_of_another_maker_are_named_at_the_first_one():
+    unit = RigLidar(model="XT16")
+    with pytest.raises(LinkError, match=r"these packets come from a VLP-16, the rig's LiDAR is a XT16: set rig.lidar"):
+        Lidar(slice_ms=ONE_PACKET_MS, unit=unit).decode(record(packet()))
 
 
 def test_an_hdl64_is_recognised_by_its_lower_blocks():

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import bz2
+import contextlib
+import gzip
 import itertools
 import json
+import lzma
 import math
-from contextlib import suppress
+import sqlite3
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-from bag_files import START_NS, Entry, header, scan, write_bag
+from bag_files import START_NS, Entry, build, header, scan, typestore, write_bag
 from numpy.testing import assert_allclose
 from typer.testing import CliRunner
 
@@ -30,6 +34,7 @@ from stages.messages import AutopilotStatus, DroneAttitude, DroneGnss, DroneImu,
 
 ROOT = Path(__file__).resolve().parents[3]
 OTHER = ROOT.parent / "shared" / "data" / "lidar_other"
+OS1 = OTHER / "OS-1-32-G_v2.1.1_1024x10.json"
 SCAN, CLOUD = "velodyne_msgs/msg/VelodyneScan", "sensor_msgs/msg/PointCloud2"
 JOINTS, STRING = "sensor_msgs/msg/JointState", "std_msgs/msg/String"
 RIG = (
@@ -136,7 +141,20 @@ def test_a_bag_that_was_never_closed_or_is_cut_is_refused_with_advice(tmp_path: 
 def test_a_file_compressed_as_a_whole_is_named_as_that(tmp_path: Path):
     folder = write_bag(tmp_path / "sqlite", scans(), compression="FILE")
     (file,) = folder.glob("*.zstd")
-    assert "compressed as a whole" in refused(file, tmp_path)
+    assert "compressed as a whole: give its folder with metadata.yaml" in refused(file, tmp_path)
+    data = write_bag(tmp_path / "a.bag", scans()).read_bytes()
+    for compress, unpack in ((gzip.compress, "gunzip -k"), (bz2.compress, "bunzip2 -k"), (lzma.compress, "unxz -k")):
+        file = tmp_path / "a.bag.packed"
+        file.write_bytes(compress(data))
+        assert f"compressed as a whole: unpack it first (`{unpack} {file}`)" in refused(file, tmp_path)
+
+
+def test_a_folder_without_its_metadata_names_the_file_in_it(tmp_path: Path):
+    folder = write_bag(tmp_path / "mcap", scans())
+    (folder / "metadata.yaml").unlink()
+    text = refused(folder, tmp_path)
+    assert f"has no metadata.yaml, so that it is no ROS 2 bag: name the file {folder / 'mcap.mcap'}" in text
+    assert len(imported(tmp_path, folder / "mcap.mcap")[1]) == 152
 
 
 @pytest.mark.parametrize("name", ["a.bag", "sqlite", "mcap"])
@@ -150,7 +168,7 @@ def test_flipped_bytes_raise_only_link_errors(tmp_path: Path, name: str):
         for at in random.integers(13, len(data) if random.random() < 0.5 else 800, 3):
             damaged[at] ^= random.integers(1, 256)
         file.write_bytes(damaged)
-        with suppress(LinkError):
+        with contextlib.suppress(LinkError):
             import_file(bag, tmp_path / "out.mcap", overwrite=True)
             (tmp_path / "out.mcap").unlink()
         assert not (tmp_path / "out.mcap").exists()
@@ -191,7 +209,12 @@ def test_an_ouster_is_known_by_the_metadata_in_the_bag_and_refused_without(tmp_p
     other = metadata.replace('"prod_sn": "', '"prod_sn": "9')
     assert other != metadata
     metadata_entry = ("/ouster/metadata", STRING, datagrams[0].time_ns, {"data": other})
-    assert "serial number" in refused(write_bag(tmp_path / "other", [metadata_entry, *entries]), tmp_path)
+    text = refused(write_bag(tmp_path / "other", [metadata_entry, *entries]), tmp_path)
+    assert "from Ouster with serial number 992137000142" in text
+    assert "every point would be wrong. Give this unit's metadata" in text
+    metadata_entry = ("/ouster/metadata", STRING, datagrams[0].time_ns, {"data": OS1.read_text()})
+    text = refused(write_bag(tmp_path / "os1", [metadata_entry, *entries]), tmp_path)
+    assert "have 8448 bytes; those of the OS1-32 of the rig's metadata have 6464 bytes: give the LiDAR's own" in text
     metadata_entry = ("/ouster/metadata", STRING, datagrams[0].time_ns, {"data": "{}"})
     assert "not the metadata of an Ouster" in refused(
         write_bag(tmp_path / "empty", [metadata_entry, *entries]), tmp_path
@@ -203,6 +226,8 @@ def test_the_rigs_model_must_be_the_packets(tmp_path: Path):
     text = refused(bag, tmp_path, rig_yaml=RIG.replace("VLP-16", "VLP-32C"))
     assert "from Velodyne VLP-16" in text
     assert "not a VLP-32C" in text
+    text = refused(bag, tmp_path, rig_yaml=RIG.replace("VLP-16", "XT32"))
+    assert "152 packets on /velodyne_packets are from a VLP-16; those of a XT32 have 1080 bytes: give" in text
 
 
 def test_a_lidar_on_a_servo_needs_its_rig(tmp_path: Path):
@@ -549,10 +574,32 @@ def test_missing_topics_and_wrong_types_are_named(tmp_path: Path):
     assert "nothing that grd can use: /talk (std_msgs/msg/String)" in refused(only, tmp_path)
 
 
+def older_bag(folder: Path, kind: str, definitions: dict[str, str], values: dict[str, Any]) -> Path:
+    """A ROS 2 bag of before Iron, which stores no definitions: one message of a type that only its writer knows."""
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import get_types_from_msg
+
+    store = typestore()
+    for name, text in definitions.items():
+        store.register(get_types_from_msg(text, name))
+    with Writer(folder, version=8, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        connection = writer.add_connection("/thing", kind, typestore=store)
+        writer.write(connection, START_NS, store.serialize_cdr(build(store, kind, values), kind))
+    (file,) = folder.glob("*.db3")
+    with contextlib.closing(sqlite3.connect(file)) as database, database:
+        database.execute("DELETE FROM message_definitions")
+    return folder
+
+
 def test_a_message_type_without_a_definition_is_named(tmp_path: Path):
-    bag = write_bag(tmp_path / "sqlite", scans())
-    (file,) = bag.glob("*.db3")
-    for path in (file, bag / "metadata.yaml"):
-        path.write_bytes(path.read_bytes().replace(b"velodyne_msgs/msg/VelodyneScan", b"hesai_lidar/msg/PandarScan"))
-    text = refused(bag, tmp_path)
-    assert text.startswith(str(bag))
+    kind = "hesai_lidar/msg/PandarScan"
+    definitions = {
+        "hesai_lidar/msg/PandarPacket": "builtin_interfaces/Time stamp\nuint8[1500] data\nuint32 size\n",
+        kind: "std_msgs/Header header\nhesai_lidar/PandarPacket[] packets\n",
+    }
+    values = scan(START_NS, [(START_NS, PACKETS[0].data)], 1500)
+    text = refused(older_bag(tmp_path / "scan", kind, definitions, values), tmp_path)
+    assert f"/thing has messages of type {kind}, which the bag does not define" in text
+    assert "record it as .mcap" in text
+    text = refused(older_bag(tmp_path / "b", "a/msg/Thing", {"a/msg/Thing": "int32 a\n"}, {"a": 1}), tmp_path)
+    assert "nothing that grd can use: /thing (a/msg/Thing)" in text

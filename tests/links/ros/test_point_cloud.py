@@ -175,7 +175,12 @@ def test_a_cloud_without_times_or_rings_is_refused():
     xyz = {name: points.xyz_lidar_m[:, k] for k, name in enumerate("xyz")}
     for columns, says in (
         ({**xyz, "ring": points.laser}, "its points have no time (fields: x, y, z, ring)"),
-        ({**xyz, "time": np.zeros(n, np.float32)}, "no x, y, z and ring"),
+        ({**xyz, "time": np.zeros(n, np.float32)}, "its points have no ring (fields: x, y, z, time)"),
+        ({"x": xyz["x"], "ring": points.laser, "time": np.zeros(n, np.float32)}, "its points have no y, z (fields"),
+        (
+            {**xyz, "ring": points.laser, "time": np.zeros(n, np.float32)},
+            "all points of a cloud have the same time: the drone would be smeared",
+        ),
     ):
         with pytest.raises(LinkError) as error:
             encoded([(0, build(STORE, CLOUD, cloud(0, columns)))], unit)

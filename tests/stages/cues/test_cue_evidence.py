@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from stages.cues.bias import AGREES_NS, CONTRADICTS_NS, LEAST, CueBias
-from stages.cues.evidence import CueEvidence, CueWeights, ObjectState, measure, slow_covariance_m2
+from stages.cues.evidence import NO_CUE, CueEvidence, CueWeights, ObjectState, measure, slow_covariance_m2
 from stages.geometry.frames import rotation_z
 from stages.geometry.trajectory import VehicleTrajectory
 from stages.messages import CueKind, DroneCue, VehicleMotion
@@ -137,7 +137,7 @@ def test_a_cue_30_m_off_is_reported_and_not_used():
     assert not state.trusted
     assert "contradicts the LiDAR, 29.7 m" in state.reason
     assert state.xyz_vehicle_m is None
-    assert evidence.nats(thing(wrong_m, 0.4), TRAIL, START_NS + 400_000_000) == (0.0, "")
+    assert evidence.nats(thing(wrong_m, 0.4), TRAIL, START_NS + 400_000_000) == NO_CUE
 
 
 def test_a_cue_is_trusted_again_after_it_agreed_for_some_time():
@@ -192,7 +192,7 @@ def test_a_new_frame_map_restores_the_priors_and_keeps_the_trust():
         evidence.add(gnss(PLACE_M + np.array([2.0, -3.0, 1.0]), 0.2 * k), TRAIL, [thing(t_s=0.2 * k)])
         evidence.add(uwb(range_m + 20.0, 0.2 * k), TRAIL, [thing(t_s=0.2 * k)])
     evidence.reset()
-    assert evidence.nats(thing(t_s=1.8), TRAIL, START_NS + 1_800_000_000) == (0.0, "")
+    assert evidence.nats(thing(t_s=1.8), TRAIL, START_NS + 1_800_000_000) == NO_CUE
     state = evidence.add(gnss(t_s=2.0), TRAIL, [])
     assert state.bias_m == pytest.approx(np.zeros(3))
     assert state.bias_sigma_m == pytest.approx(3.5)

@@ -27,20 +27,28 @@ def cast(origin: np.ndarray, directions: np.ndarray, walls: list[tuple[int, floa
     return np.where(nearest < 100, nearest, 0.0)
 
 
-def slices(speed_mps: float, seconds: float, walls: list[tuple[int, float]], seed: int = 1, yaw_rad: float = 0.3):
+def slices(
+    speed_mps: float,
+    seconds: float,
+    walls: list[tuple[int, float]],
+    seed: int = 1,
+    yaw_rad: float = 0.3,
+    beams: np.ndarray = ELEVATION,
+):
     """(slice, positions of the vehicle at its ends) along x; the fan's plane has the yaw `yaw_rad` against the motion."""
+    lasers = len(beams)
     rng = np.random.default_rng(seed)
     for k in range(int(seconds / (FIRINGS * FIRING_S))):
-        at_s = np.repeat((k * FIRINGS + np.arange(FIRINGS)) * FIRING_S, 16)
-        azimuth, elevation = 2 * np.pi * at_s / REVOLUTION_S, np.tile(ELEVATION, FIRINGS)
+        at_s = np.repeat((k * FIRINGS + np.arange(FIRINGS)) * FIRING_S, lasers)
+        azimuth, elevation = 2 * np.pi * at_s / REVOLUTION_S, np.tile(beams, FIRINGS)
         fan = np.column_stack((np.cos(azimuth) * np.cos(elevation), np.sin(elevation), np.sin(azimuth)))
         fan[:, 2] *= np.cos(elevation)
         directions = fan @ rotation_z(yaw_rad).T
         origin = np.array([0.0, 0.0, 0.35])
         ends = tuple(np.array([speed_mps * t, 0.0, 0.0]) for t in (at_s[0], at_s[-1]))
         range_m = np.zeros(len(at_s))
-        for row, t in enumerate(at_s[::16]):
-            at = slice(16 * row, 16 * row + 16)
+        for row, t in enumerate(at_s[::lasers]):
+            at = slice(lasers * row, lasers * row + lasers)
             range_m[at] = cast(origin + np.array([speed_mps * t, 0.0, 0.0]), directions[at], walls)
         range_m = np.where(range_m > 0, range_m + rng.normal(0, 0.02, len(range_m)), 0.0)
         yield (
@@ -49,7 +57,7 @@ def slices(speed_mps: float, seconds: float, walls: list[tuple[int, float]], see
                 point_stamp_ns=np.rint(S * at_s).astype(np.int64),
                 direction_vehicle=directions.astype(np.float32),
                 range_m=range_m.astype(np.float32),
-                laser=np.tile(np.arange(16, dtype=np.uint8), FIRINGS),
+                laser=np.tile(np.arange(lasers, dtype=np.uint8), FIRINGS),
                 reflectivity=np.zeros(len(at_s), np.uint8),
                 turntable_rad=0.0,
                 origin_vehicle_m=(0.0, 0.0, 0.35),
@@ -90,6 +98,12 @@ def test_a_parked_vehicle_has_no_error():
 
 def test_between_walls_along_the_road_nothing_is_measured():
     assert errors(5.0, 0.0, walls=ALONG_ONLY) == []
+
+
+@pytest.mark.parametrize("beams_deg", [np.arange(-15.0, 16.0, 2.0) / 1.5, np.linspace(-16.0, 15.0, 32)])
+def test_with_other_beams_nothing_is_measured(beams_deg: np.ndarray):
+    """Puck Hi-Res and XT32."""
+    assert errors(5.0, 0.0, beams=np.radians(beams_deg)) == []
 
 
 def made(values: list[float], period_s: float = 0.1, speed_mps: float = 5.0) -> list[VelocityError]:

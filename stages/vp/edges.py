@@ -68,7 +68,7 @@ class EdgeFinder:
 
 
 def _spans(usable: NDArray[np.uint8]) -> NDArray[np.int64]:
-    """First and one past the last column (h, 2) of each row where the gradient at or next to a usable pixel is needed."""
+    """First and one past the last column (h, 2) of each row at or next to a usable pixel."""
     near = cv2.dilate(usable, np.ones((3, 3), dtype=np.uint8)) > 0
     first, last = near.argmax(axis=1), near.shape[1] - near[:, ::-1].argmax(axis=1)
     return np.where(near.any(axis=1)[:, None], np.column_stack([first, last]), 0).astype(np.int64)

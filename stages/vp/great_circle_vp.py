@@ -63,8 +63,8 @@ class GreatCircleVpSettings(Settings):
     max_frames: int = Field(3, ge=1, le=6)  # horizontal pairs; 1: Manhattan
     min_lines: int = Field(4, ge=2)  # of a horizontal pair
     min_score: float = Field(7.0, gt=0)  # in standard deviations above lines of random directions
-    min_direction_score: float = Field(2.0, ge=-100)  # of each direction of a further pair, in the same units
-    min_elsewhere_score: float = Field(4.0, ge=-100)  # of a further pair without the lines of any 90 deg of azimuth
+    min_direction_score: float = Field(3.0, ge=-100)  # of each direction of a further pair, in the same units
+    min_elsewhere_score: float = Field(6.0, ge=-100)  # of a further pair without the lines of any 90 deg of azimuth
     least_sigma_deg: float = Field(0.15, gt=0, le=5)  # beyond that of the lines: buildings are not exactly square
 
     @model_validator(mode="after")

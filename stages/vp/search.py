@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.geometry.lens import Array64
-from stages.kernels.vp.directions import all_directions, upright
+from stages.kernels.vp.directions import PARTS, all_directions, parts_of, upright, without
 from stages.kernels.vp.spectrum import APART_RAD
-from stages.vp.directions import Lines, Structure, assign, refine, residual_sigma
+from stages.vp.directions import Lines, Structure, assign, jackknife, refine, residual_sigma
 from stages.vp.spectrum import pair_support, peaks, wrap_90deg, yaw_spectrum
 from stages.vp.verticals import propose_verticals, refine_vertical
 
@@ -156,10 +156,11 @@ def _near(lines: Lines, axes: Array64, yaw: float, limits: SearchLimits) -> NDAr
 
 
 def _directions_of(lines: Lines, s: Structure, limits: SearchLimits) -> FoundDirections:
-    """The directions that have lines; sigmas from the information matrix, combined with `least_sigma`."""
+    """The directions that have lines; sigmas by the larger of information matrix and jackknife, with `least_sigma`."""
     directions = all_directions(s.axes, s.yaw_rad)
     counts = np.bincount(s.assigned[s.assigned >= 0], minlength=len(directions))
     cov: Array64 = np.linalg.inv(s.information).astype(np.float64) * max(s.scatter, limits.least_scatter) ** 2
+    parts = jackknife(lines, s, limits.sigma_model)
     rows: list[Array64] = []
     sigmas: list[float] = []
     frames: list[int] = []
@@ -172,7 +173,7 @@ def _directions_of(lines: Lines, s: Structure, limits: SearchLimits) -> FoundDir
         number[k] = len(rows)
         rows.append(d)
         frames.append(f)
-        sigmas.append(math.hypot(_sigma(cov, s.axes, d, f), limits.least_sigma))
+        sigmas.append(math.hypot(max(_sigma(c, s.axes, d, f) for c in (cov, parts)), limits.least_sigma))
     line_direction = np.where(s.assigned >= 0, number[s.assigned], -1)
     if not rows:
         return _no_directions(len(lines.normal), "no direction has enough lines after refinement")
@@ -199,10 +200,19 @@ def _vertical_only(
     reason = f"no horizontal structure: best score {peak:.1f} sigma, required {limits.min_score:g}"
     if near.sum() < limits.min_lines or prior.cone_rad > 0:
         return _no_directions(len(near), reason)
-    e = upright(v)[:, :2]
-    J = lines.normal[near] @ e / residual_sigma(lines, v, limits.sigma_model)[near, None]
-    H = (J.T * lines.weight[near]) @ J + np.eye(2) / prior.sigma_rad**2
-    sigma = math.hypot(math.sqrt(float(np.trace(np.linalg.inv(H))) / 2), limits.least_sigma)
+    axes = upright(v)
+    spread = residual_sigma(lines, v, limits.sigma_model)[near]
+    J, r = lines.normal[near] @ axes[:, :2] / spread[:, None], lines.normal[near] @ v / spread
+    weighted = J.T * lines.weight[near]
+    H = weighted @ J + np.eye(2) / prior.sigma_rad**2
+    part = parts_of(lines.normal[near], lines.tangent[near], axes)
+    steps = [
+        without(H, weighted[:, part == k] @ J[part == k], weighted[:, part == k] @ r[part == k]) for k in range(PARTS)
+    ]
+    by_parts = (PARTS - 1) / PARTS * np.square(steps).sum() / 2
+    sigma = math.hypot(math.sqrt(max(float(np.trace(np.linalg.inv(H))) / 2, by_parts)), limits.least_sigma)
+    if sigma > prior.sigma_rad:
+        return _no_directions(len(near), f"{reason}; parts of the upright lines disagree")
     none = np.array([-1], dtype=np.int64)
     return FoundDirections(v[None], np.array([sigma]), none, np.where(near, 0, -1).astype(np.int64), reason)
 

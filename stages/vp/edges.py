@@ -38,7 +38,6 @@ class EdgeFinder:
         inside = slice(border, height - border), slice(border, width - border)
         self._usable[inside] = usable[inside]
         self._span = _spans(self._usable)
-        self._unvisited = np.empty_like(self._usable)
         self._slopes = np.zeros(usable.shape, dtype=np.int32)
         self._smooth, self._steep = np.empty(width, dtype=np.int16), np.empty(width, dtype=np.int16)
         self._seeds = np.empty(height * (width // LATTICE + 1), dtype=np.int64)
@@ -52,11 +51,9 @@ class EdgeFinder:
         seeds, counts = slopes_and_seeds(
             grey, self._usable, self._span, least, self._slopes, self._smooth, self._steep, self._seeds
         )
-        np.copyto(self._unvisited, self._usable)
         count, chains = follow(
             grey,
             self._slopes,
-            self._unvisited,
             self._seeds[:seeds],
             thresholds(counts, self._min_contrast),
             self._min_points,

@@ -160,7 +160,7 @@ def _directions_of(lines: Lines, s: Structure, limits: SearchLimits) -> FoundDir
     directions = all_directions(s.axes, s.yaw_rad)
     counts = np.bincount(s.assigned[s.assigned >= 0], minlength=len(directions))
     cov: Array64 = np.linalg.inv(s.information).astype(np.float64) * max(s.scatter, limits.least_scatter) ** 2
-    parts = jackknife(lines, s, limits.sigma_model)
+    sigma = _sigmas(np.array([cov, jackknife(lines, s, limits.sigma_model)]), directions @ s.axes)
     rows: list[Array64] = []
     sigmas: list[float] = []
     frames: list[int] = []
@@ -173,7 +173,7 @@ def _directions_of(lines: Lines, s: Structure, limits: SearchLimits) -> FoundDir
         number[k] = len(rows)
         rows.append(d)
         frames.append(f)
-        sigmas.append(math.hypot(max(_sigma(c, s.axes, d, f) for c in (cov, parts)), limits.least_sigma))
+        sigmas.append(math.hypot(sigma[k], limits.least_sigma))
     line_direction = np.where(s.assigned >= 0, number[s.assigned], -1)
     if not rows:
         return _no_directions(len(lines.normal), "no direction has enough lines after refinement")
@@ -182,15 +182,19 @@ def _directions_of(lines: Lines, s: Structure, limits: SearchLimits) -> FoundDir
     return FoundDirections(np.array(rows), np.array(sigmas), np.array(frames, dtype=np.int64), line_direction, reason)
 
 
-def _sigma(cov: Array64, axes: Array64, d: Array64, frame: int) -> float:
-    """One-axis sigma of a direction: d -> d + omega x d, omega in frame 0's axes, yaw added to its third."""
-    A = np.zeros((3, len(cov)))
-    A[:, :3] = np.eye(3)
-    if frame > 0:
-        A[2, 2 + frame] = 1.0
-    turn = A @ cov @ A.T
-    local = axes.T @ d
-    return math.sqrt(max(float(turn.trace() - local @ turn @ local) / 2, 0.0))  # a rotation about d does not change d
+def _sigmas(cov: Array64, local: Array64) -> list[float]:
+    """Largest one-axis sigma of each direction (k, 3), in frame 0's axes, by covariances (c, n, n) of the unknowns.
+
+    d -> d + omega x d, omega in frame 0's axes; the yaw of a further frame is added to its third.
+    """
+    A = np.zeros((len(local), 3, cov.shape[1]))
+    A[:, range(3), range(3)] = 1.0
+    for k in range(3, len(local)):
+        A[k, 2, 2 + (k - 1) // 2] = 1.0
+    turn = A @ cov[:, None] @ A.transpose(0, 2, 1)
+    about = (turn @ local[:, :, None])[..., 0]
+    squares = (turn[..., 0, 0] + turn[..., 1, 1] + turn[..., 2, 2] - (about * local).sum(axis=2)) / 2
+    return np.sqrt(np.maximum(squares, 0.0)).max(axis=0).tolist()  # a rotation about d does not change d
 
 
 def _vertical_only(
@@ -206,10 +210,11 @@ def _vertical_only(
     weighted = J.T * lines.weight[near]
     H = weighted @ J + np.eye(2) / prior.sigma_rad**2
     part = parts_of(lines.normal[near], lines.tangent[near], axes)
-    steps = [
-        without(H, weighted[:, part == k] @ J[part == k], weighted[:, part == k] @ r[part == k]) for k in range(PARTS)
-    ]
-    by_parts = (PARTS - 1) / PARTS * np.square(steps).sum() / 2
+    inside = [part == k for k in range(PARTS)]
+    if near.sum() - max(own.sum() for own in inside) < limits.min_lines:
+        return _no_directions(len(near), f"{reason}; the upright lines are in one part of the image")
+    steps = [without(H, weighted[:, own] @ J[own], weighted[:, own] @ r[own]) for own in inside]
+    by_parts = (PARTS - 1) / PARTS * float(np.square(steps).sum()) / 2
     sigma = math.hypot(math.sqrt(max(float(np.trace(np.linalg.inv(H))) / 2, by_parts)), limits.least_sigma)
     if sigma > prior.sigma_rad:
         return _no_directions(len(near), f"{reason}; parts of the upright lines disagree")

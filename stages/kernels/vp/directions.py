@@ -22,6 +22,7 @@ FEW_LINES = 10  # weight of the prior scatter, in lines
 GATE = 4.0  # sigmas; lines further from all directions are unassigned
 PARTS = 8  # of azimuth about the camera, for the spread of estimates without one part
 LEAST_SHARE = 1e-2  # of the information: a part with all the rest cannot be tested
+LEAST_CURVATURE = 0.3  # of the robust cost, as a share of its weights; Gaussian residuals of one sigma: 0.6
 WELL = 1.0 + 1e-9  # margin that decides a bound independently of rounding
 
 
@@ -171,11 +172,19 @@ def jackknife_kernel(
 ) -> Array64:
     """Covariance of the unknowns by the block jackknife: PARTS estimates, each without the lines of one azimuth part.
 
-    Each is one Gauss-Newton step from the whole estimate, with its assignment and weights.
+    Each is one Newton step from the whole estimate, with its assignment; of the robust cost, whose curvature is less
+    than its weights.
     """
     directions = all_directions(axes, yaw_rad)
     assigned, r, spread = assign_kernel(normal, tangent, sigma, directions, sigma_model)
     part = parts_of(normal, tangent, axes)
+    weights, curvature = 1e-9, 0.0
+    for i in range(len(normal)):
+        if assigned[i] != NONE:
+            q = (r[i] / (CAUCHY * spread[i])) ** 2
+            weights += weight[i] / (1.0 + q)
+            curvature += weight[i] * (1.0 - q) / (1.0 + q) ** 2
+    scale = (PARTS - 1.0) / PARTS / max(curvature / weights, LEAST_CURVATURE) ** 2
     out = np.zeros_like(information)
     for k in range(PARTS):
         inside = np.where(part == k, assigned, NONE)
@@ -183,7 +192,7 @@ def jackknife_kernel(
         step = without(information, H, g)
         for a in range(len(out)):
             for b in range(len(out)):
-                out[a, b] += (PARTS - 1.0) / PARTS * step[a] * step[b]
+                out[a, b] += scale * step[a] * step[b]
     return out
 
 

@@ -12,7 +12,8 @@ from stages.kernels.compiled import compiled
 
 Grey = NDArray[np.uint8]
 Row = NDArray[np.int16]
-Slopes = NDArray[np.int32]  # along the row in the lower 16 bits, along the column in the upper ones
+Slopes = NDArray[np.int32]  # bit 0: the pixel is free; bits 1 to 15: slope along the row; 16 to 31: along the column
+FREE = 1
 REACH = 2  # of the gradient: it has 5 x 5 pixels
 LATTICE = 7  # a seed in each LATTICE columns of a row, shifted by 2 from row to row
 LEVELS = 16  # number of bins of the grey levels
@@ -52,16 +53,17 @@ def slopes_and_seeds(
             rows = (grey[y - 2, left:right], grey[y - 1, left:right], grey[y, left:right])
             more = (grey[y + 1, left:right], grey[y + 2, left:right])
             _across_rows(rows[0], rows[1], rows[2], more[0], more[1], smooth[: right - left], steep[: right - left])
-            _along_row(smooth[: right - left], steep[: right - left], slopes[y, first:last])
+            _along_row(smooth[: right - left], steep[: right - left], usable[y, first:last], slopes[y, first:last])
         y_seed = y - 1  # its neighbours are known by now
         first, last = span[y_seed, 0], span[y_seed, 1]
         if y_seed % NOISE_ROWS == 0:
-            _count(grey[y_seed], slopes[y_seed], usable[y_seed], first, last, counts)
+            _count(grey[y_seed], slopes[y_seed], first, last, counts)
         for x in range(first + (2 * y_seed - first) % LATTICE, last, LATTICE):
             at = y_seed * width + x
-            gx, gy = _both(flat[np.uint64(at)])
+            slope = flat[np.uint64(at)]
+            gx, gy = _both(slope)
             square = gx * gx + gy * gy
-            if square < least or not usable[y_seed, np.uint64(x)]:
+            if square < least or not slope & FREE:
                 continue
             across = 1 if abs(gx) > abs(gy) else width  # is it the ridge?
             ax, ay = _both(flat[np.uint64(at + across)])
@@ -82,35 +84,35 @@ def _across_rows(a: Grey, b: Grey, c: Grey, d: Grey, e: Grey, smooth: Row, steep
 
 
 @compiled
-def _along_row(smooth: Row, steep: Row, out: Slopes) -> None:
-    """(-1 -2 0 2 1) of smooth and (1 4 6 4 1) of steep along the row."""
+def _along_row(smooth: Row, steep: Row, usable: NDArray[np.uint8], out: Slopes) -> None:
+    """(-1 -2 0 2 1) of smooth and (1 4 6 4 1) of steep along the row, and whether each pixel is usable."""
     n = len(out)
     a, b, d, e = smooth[:n], smooth[1 : n + 1], smooth[3 : n + 3], smooth[4 : n + 4]
     p, q, r, s, t = steep[:n], steep[1 : n + 1], steep[2 : n + 2], steep[3 : n + 3], steep[4 : n + 4]
     for i in range(n):
         gx = np.int16(e[i] - a[i] + 2 * (d[i] - b[i]))
         gy = np.int16(p[i] + t[i] + 4 * (q[i] + s[i]) + 6 * r[i])
-        out[i] = np.int32(gy) * 65536 + np.int32(np.uint16(gx))
+        out[i] = np.int32(gy) * 65536 + np.int32(np.uint16(gx) & 0xFFFE) + np.int32(usable[i])
 
 
 @compiled
 def _both(slope: np.int32) -> tuple[int, int]:
     """Slopes along the row and along the column."""
-    return np.int32(np.int16(slope)), np.int32(slope >> 16)
+    return np.int32(np.int16(slope & ~FREE)), np.int32(slope >> 16)
 
 
 @compiled
 def _count(
     grey: NDArray[np.uint8],
     slopes: NDArray[np.int32],
-    usable: NDArray[np.uint8],
     first: int,
     last: int,
     counts: NDArray[np.int64],
 ) -> None:
     for x in range(first, last, LATTICE):
-        if usable[np.uint64(x)]:
-            gx, gy = _both(slopes[np.uint64(x)])
+        slope = slopes[np.uint64(x)]
+        if slope & FREE:
+            gx, gy = _both(slope)
             level = grey[np.uint64(x)] * LEVELS // 256
             counts[level, min(abs(gx) // BIN_SLOPE, BINS - 1)] += 1
             counts[level, min(abs(gy) // BIN_SLOPE, BINS - 1)] += 1
@@ -136,7 +138,6 @@ def thresholds(counts: NDArray[np.int64], min_contrast: float) -> NDArray[np.flo
 def follow(
     grey: Grey,
     slopes: Slopes,
-    free: NDArray[np.uint8],
     seeds: NDArray[np.int64],
     threshold: NDArray[np.float32],
     min_points: int,
@@ -146,24 +147,25 @@ def follow(
 ) -> tuple[int, int]:
     """Follow chains from the seeds; returns the number of points and of chains.
 
-    `free` is used up; it is 0 in a border of REACH + 1 pixels.
+    Pixels next to a chain are free no more; none is free in a border of REACH + 1 pixels.
     """
     width = grey.shape[1]
-    flat, flat_free, levels = slopes.ravel(), free.ravel(), grey.ravel()
+    flat, levels = slopes.ravel(), grey.ravel()
     most = len(back)
     chains, count = 0, 0
     for at in seeds:
-        gx, gy = _both(flat[np.uint64(at)])
+        slope = flat[np.uint64(at)]
+        gx, gy = _both(slope)
         limit = threshold[levels[np.uint64(at)] * LEVELS // 256]
-        if gx * gx + gy * gy < limit or not flat_free[np.uint64(at)]:
+        if gx * gx + gy * gy < limit or not slope & FREE:
             continue
         if count + 2 * most > len(points) or chains + 2 > len(start):
             break
         low = int(LOW_SHARE * LOW_SHARE * limit)
-        backward = _follow(flat, flat_free, width, at, -1, low, back)
+        backward = _follow(flat, width, at, -1, low, back)
         for k in range(backward):
             points[count + k] = back[backward - 1 - k]
-        forward = _follow(flat, flat_free, width, at, 1, low, back)  # begins with the seed again
+        forward = _follow(flat, width, at, 1, low, back)  # begins with the seed again
         for k in range(1, forward):
             points[count + backward + k - 1] = back[k]
         total = backward + forward - 1
@@ -177,7 +179,6 @@ def follow(
 @compiled
 def _follow(
     slopes: NDArray[np.int32],
-    free: NDArray[np.uint8],
     width: int,
     at: int,
     way: int,
@@ -207,15 +208,18 @@ def _follow(
             out[count, 1] = row + (0.0 if steep_x else shift)
             count += 1
         steps += 1
-        free[np.uint64(at)], free[np.uint64(at + across)], free[np.uint64(at - across)] = 0, 0, 0
+        slopes[np.uint64(at)] &= ~FREE
+        slopes[np.uint64(at + across)] &= ~FREE
+        slopes[np.uint64(at - across)] &= ~FREE
         # the edge runs across the gradient: one step along its main axis, to the steepest of three pixels
         step = (way if gx > 0 else -way) if steep_x else (-way if gy > 0 else way)
         ahead_at = at + (step * width if steep_x else step)
         best, best_side, next_x, next_y = np.int64(low), 2, gx, gy
         for side in range(-1, 2):
             to = np.uint64(ahead_at + side * across)  # as this is never negative, no index is wound around
-            if free[to]:
-                hx, hy = _both(slopes[to])
+            slope = slopes[to]
+            if slope & FREE:
+                hx, hy = _both(slope)
                 more, dot = np.int64(hx * hx + hy * hy), np.int64(gx * hx + gy * hy)
                 if more > best and dot > 0 and 2 * dot * dot > square * more:  # turned by less than 45 deg
                     best, best_side, next_x, next_y = more, side, hx, hy

@@ -16,7 +16,7 @@ from stages.vp.spectrum import peaks, yaw_spectrum
 from stages.vp.verticals import propose_verticals, refine_vertical
 
 SIGMA = np.radians(0.25)
-LIMITS = SearchLimits(SIGMA, np.radians(0.05), 0.3, 3, 4, 7.0, 2.0, 4.0)
+LIMITS = SearchLimits(SIGMA, np.radians(0.05), 0.3, 3, 4, 7.0, 2.0, 4.0, 3.0, 6.0, np.radians(15))
 UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -169,6 +169,17 @@ def test_two_horizontal_frames_are_separated_and_numbered_by_strength():
         lines_along(rows, each=12), VerticalPrior(UP, np.radians(3), 0.0), dataclasses.replace(LIMITS, max_frames=1)
     )
     assert list(one.frame) == [-1, 0, 0]
+
+
+def test_a_further_pair_that_stands_out_less_is_stated_as_unsure():
+    other = rotation_z(np.radians(30.0))
+    rows = np.vstack([np.eye(3), np.eye(3)[:2], other[:, :2].T])
+    limits = dataclasses.replace(LIMITS, sure_elsewhere_score=100.0)
+    found = find_structure(lines_along(rows, each=12), VerticalPrior(UP, np.radians(3), 0.0), limits)
+    assert list(found.frame) == [-1, 0, 0, 1, 1]
+    assert (np.degrees(found.sigma_rad[:3]) < 0.5).all()
+    np.testing.assert_allclose(np.degrees(found.sigma_rad[3:]), 15.0, atol=0.1)
+    assert found.reason.startswith("2 horizontal frames (1 unsure)")
 
 
 @pytest.mark.parametrize(("apart_deg", "frames"), [(3.0, {-1, 0}), (7.0, {-1, 0, 1})])

@@ -118,9 +118,9 @@ def _along_vertical(lines: Lines, vertical: Array64, limits: SearchLimits) -> ND
 def _frames(lines: Lines, axes: Array64, limits: SearchLimits) -> tuple[list[float], list[bool], float]:
     """Yaws of the significant horizontal pairs relative to `axes`, the axes of the best pair.
 
-    Also returns whether each is sure, and the score of the first. A further pair must stand out without the lines of any 90 deg of azimuth, in
-    which a board, a car or a shelf lies; and each of its directions by itself: an object such as a shadow edge
-    has one direction only.
+    Also returns whether each is sure, and the score of the first. A further pair must stand out without the lines of
+    any 90 deg of azimuth, in which a board, a car or a shelf lies; and each of its directions by itself: an object such
+    as a shadow edge has one direction only.
     """
     free = ~_along_vertical(lines, axes[:, 2], limits)
     yaws: list[float] = []

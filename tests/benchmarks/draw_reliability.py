@@ -98,7 +98,7 @@ def save_failure(file: Path, scene: str, view: View, ends: np.ndarray, result: D
     text = (f"{scene}, {view.camera_mount.value}: {result.reason}", f"error (stated sigma) [deg]: {errors or '-'}")
     bar = np.full((50, image.shape[1], 3), 255, np.uint8)
     for row, line in enumerate(text):
-        cv2.putText(bar, line[:110], (6, 20 + 22 * row), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (0, 0, 0), 1, cv2.LINE_AA)
+        cv2.putText(bar, line[:140], (6, 20 + 22 * row), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (0, 0, 0), 1, cv2.LINE_AA)
     cv2.imwrite(str(file), np.vstack([image, bar]), [cv2.IMWRITE_JPEG_QUALITY, 70])
     print(f"{file.name}: {' | '.join(text)}")  # noqa: T201
 

@@ -66,6 +66,7 @@ class EdgeFinder:
 
 def _spans(usable: NDArray[np.uint8]) -> NDArray[np.int64]:
     """First and one past the last column (h, 2) of each row at or next to a usable pixel."""
-    near = cv2.dilate(usable, np.ones((3, 3), dtype=np.uint8)) > 0
-    first, last = near.argmax(axis=1), near.shape[1] - near[:, ::-1].argmax(axis=1)
-    return np.where(near.any(axis=1)[:, None], np.column_stack([first, last]), 0).astype(np.int64)
+    near: NDArray[np.bool_] = np.asarray(cv2.dilate(usable, np.ones((3, 3), dtype=np.uint8)), dtype=np.bool_)
+    columns = np.column_stack([near.argmax(axis=1), near.shape[1] - near[:, ::-1].argmax(axis=1)]).astype(np.int64)
+    columns[near.sum(axis=1) == 0] = 0
+    return columns

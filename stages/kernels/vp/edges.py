@@ -98,7 +98,7 @@ def _along_row(smooth: Row, steep: Row, usable: NDArray[np.uint8], out: Slopes) 
 @compiled
 def _both(slope: np.int32) -> tuple[int, int]:
     """Slopes along the row and along the column."""
-    return np.int32(np.int16(slope & ~FREE)), np.int32(slope >> 16)
+    return np.int32(np.int16(slope & ~FREE)), np.int32(slope >> 16)  # pyright: ignore[reportReturnType]
 
 
 @compiled

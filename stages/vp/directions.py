@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.geometry.lens import Array64
-from stages.kernels.vp.directions import assign_kernel, refine_kernel, tangents
+from stages.kernels.vp.directions import assign_kernel, jackknife_kernel, refine_kernel, tangents
 from stages.vp.arcs import Arcs
 
 MAX_ITERATIONS = 8
@@ -89,4 +89,22 @@ def refine(
             sigma_model,
             iterations,
         )
+    )
+
+
+def jackknife(lines: Lines, structure: Structure, sigma_model: float) -> Array64:
+    """Covariance of the unknowns of a structure, in the order of its information, from how parts of the lines agree.
+
+    Block jackknife: the structure is estimated without the lines of each eighth of azimuth about the camera. Lines of
+    one object, such as a leaning pole or the streaks of the sun, lie in one part.
+    """
+    return jackknife_kernel(
+        lines.normal,
+        lines.tangent,
+        lines.sigma_rad,
+        lines.weight,
+        structure.axes,
+        structure.yaw_rad,
+        sigma_model,
+        structure.information,
     )

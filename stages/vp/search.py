@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.geometry.lens import Array64
-from stages.kernels.vp.directions import all_directions, upright
+from stages.kernels.vp.directions import PARTS, all_directions, parts_of, upright, without
 from stages.kernels.vp.spectrum import APART_RAD
-from stages.vp.directions import Lines, Structure, assign, refine, residual_sigma
+from stages.vp.directions import Lines, Structure, assign, jackknife, refine, residual_sigma
 from stages.vp.spectrum import pair_support, peaks, wrap_90deg, yaw_spectrum
 from stages.vp.verticals import propose_verticals, refine_vertical
 
@@ -54,6 +54,9 @@ class SearchLimits:
     min_score: float
     min_direction_score: float
     min_elsewhere_score: float
+    sure_direction_score: float
+    sure_elsewhere_score: float
+    unsure_sigma: float
 
 
 @dataclass(frozen=True)
@@ -87,12 +90,12 @@ def find_structure(lines: Lines, prior: VerticalPrior, limits: SearchLimits) -> 
         is_rival = abs(float(other.axes[:, 2] @ pairs[0].axes[:, 2])) < math.cos(RIVAL_RAD)
         if is_rival and other.agreement > RIVAL_SHARE * pairs[0].agreement:
             return _no_directions(m, "ambiguous: two verticals fit the lines about equally well; connect an attitude")
-    yaws, peak = _frames(lines, pairs[0].axes, limits)
+    yaws, sure, peak = _frames(lines, pairs[0].axes, limits)
     if not yaws:
         vertical = verticals[0] if len(verticals) == 1 else pairs[0].axes[:, 2]
         return _vertical_only(lines, vertical, prior, limits, peak)
     structure = refine(lines, pairs[0].axes, np.array(yaws), prior.up, prior.sigma_rad, limits.sigma_model)
-    return _directions_of(lines, structure, limits)
+    return _directions_of(lines, structure, sure, limits)
 
 
 def _best_pair(lines: Lines, vertical: Array64, prior: VerticalPrior, limits: SearchLimits) -> Structure:
@@ -112,15 +115,16 @@ def _along_vertical(lines: Lines, vertical: Array64, limits: SearchLimits) -> ND
     return np.abs(lines.normal @ vertical) < 3.0 * residual_sigma(lines, vertical, limits.sigma_model)
 
 
-def _frames(lines: Lines, axes: Array64, limits: SearchLimits) -> tuple[list[float], float]:
+def _frames(lines: Lines, axes: Array64, limits: SearchLimits) -> tuple[list[float], list[bool], float]:
     """Yaws of the significant horizontal pairs relative to `axes`, the axes of the best pair.
 
-    Also returns the score of the first. A further pair must stand out without the lines of any 90 deg of azimuth, in
-    which a board, a car or a shelf lies; and each of its directions by itself: an object such as a shadow edge
-    has one direction only.
+    Also returns whether each is sure, and the score of the first. A further pair must stand out without the lines of
+    any 90 deg of azimuth, in which a board, a car or a shelf lies; and each of its directions by itself: an object such
+    as a shadow edge has one direction only.
     """
     free = ~_along_vertical(lines, axes[:, 2], limits)
     yaws: list[float] = []
+    sure: list[bool] = []
     rejected: list[float] = []
     first_score = 0.0
     while len(yaws) < limits.max_frames and len(rejected) < MAX_REJECTED:
@@ -137,17 +141,14 @@ def _frames(lines: Lines, axes: Array64, limits: SearchLimits) -> tuple[list[flo
         more = FURTHER_SCORE if yaws else 0.0
         if score < limits.min_score + more or near.sum() < limits.min_lines * (1.5 if yaws else 1.0):
             break
-        if yaws and not _stands_out(lines, axes, free, yaw, limits):
-            rejected.append(yaw)
-        else:
+        direction, elsewhere = pair_support(lines, axes, free, limits.sigma_model, yaw) if yaws else (np.inf, np.inf)
+        if direction >= limits.min_direction_score and elsewhere >= limits.min_elsewhere_score:
             yaws.append(yaw)
+            sure.append(direction >= limits.sure_direction_score and elsewhere >= limits.sure_elsewhere_score)
+        else:
+            rejected.append(yaw)
         free = free & ~near
-    return yaws, first_score
-
-
-def _stands_out(lines: Lines, axes: Array64, free: NDArray[np.bool_], yaw: float, limits: SearchLimits) -> bool:
-    direction_score, elsewhere_score = pair_support(lines, axes, free, limits.sigma_model, yaw)
-    return direction_score >= limits.min_direction_score and elsewhere_score >= limits.min_elsewhere_score
+    return yaws, sure, first_score
 
 
 def _near(lines: Lines, axes: Array64, yaw: float, limits: SearchLimits) -> NDArray[np.bool_]:
@@ -155,11 +156,12 @@ def _near(lines: Lines, axes: Array64, yaw: float, limits: SearchLimits) -> NDAr
     return assign(lines, directions, 2.0 * limits.sigma_model)[0] >= 0
 
 
-def _directions_of(lines: Lines, s: Structure, limits: SearchLimits) -> FoundDirections:
-    """The directions that have lines; sigmas from the information matrix, combined with `least_sigma`."""
+def _directions_of(lines: Lines, s: Structure, sure: list[bool], limits: SearchLimits) -> FoundDirections:
+    """The directions that have lines; sigmas by the larger of information matrix and jackknife, with `least_sigma`."""
     directions = all_directions(s.axes, s.yaw_rad)
     counts = np.bincount(s.assigned[s.assigned >= 0], minlength=len(directions))
     cov: Array64 = np.linalg.inv(s.information).astype(np.float64) * max(s.scatter, limits.least_scatter) ** 2
+    sigma = _sigmas(np.array([cov, jackknife(lines, s, limits.sigma_model)]), directions @ s.axes)
     rows: list[Array64] = []
     sigmas: list[float] = []
     frames: list[int] = []
@@ -172,24 +174,30 @@ def _directions_of(lines: Lines, s: Structure, limits: SearchLimits) -> FoundDir
         number[k] = len(rows)
         rows.append(d)
         frames.append(f)
-        sigmas.append(math.hypot(_sigma(cov, s.axes, d, f), limits.least_sigma))
+        sigmas.append(math.hypot(sigma[k], limits.least_sigma, 0.0 if f < 0 or sure[f] else limits.unsure_sigma))
     line_direction = np.where(s.assigned >= 0, number[s.assigned], -1)
     if not rows:
         return _no_directions(len(lines.normal), "no direction has enough lines after refinement")
     pairs = len({f for f in frames if f >= 0})
-    reason = f"{pairs} horizontal frame{'s' if pairs != 1 else ''}, {int((line_direction >= 0).sum())} lines"
+    unsure = len({f for f in frames if f >= 0 and not sure[f]})
+    which = f" ({unsure} unsure)" if unsure else ""
+    reason = f"{pairs} horizontal frame{'s' if pairs != 1 else ''}{which}, {int((line_direction >= 0).sum())} lines"
     return FoundDirections(np.array(rows), np.array(sigmas), np.array(frames, dtype=np.int64), line_direction, reason)
 
 
-def _sigma(cov: Array64, axes: Array64, d: Array64, frame: int) -> float:
-    """One-axis sigma of a direction: d -> d + omega x d, omega in frame 0's axes, yaw added to its third."""
-    A = np.zeros((3, len(cov)))
-    A[:, :3] = np.eye(3)
-    if frame > 0:
-        A[2, 2 + frame] = 1.0
-    turn = A @ cov @ A.T
-    local = axes.T @ d
-    return math.sqrt(max(float(turn.trace() - local @ turn @ local) / 2, 0.0))  # a rotation about d does not change d
+def _sigmas(cov: Array64, local: Array64) -> list[float]:
+    """Largest one-axis sigma of each direction (k, 3), in frame 0's axes, by covariances (c, n, n) of the unknowns.
+
+    d -> d + omega x d, omega in frame 0's axes; the yaw of a further frame is added to its third.
+    """
+    A = np.zeros((len(local), 3, cov.shape[1]))
+    A[:, range(3), range(3)] = 1.0
+    for k in range(3, len(local)):
+        A[k, 2, 2 + (k - 1) // 2] = 1.0
+    turn = A @ cov[:, None] @ A.transpose(0, 2, 1)
+    about = (turn @ local[:, :, None])[..., 0]
+    squares = (turn[..., 0, 0] + turn[..., 1, 1] + turn[..., 2, 2] - (about * local).sum(axis=2)) / 2
+    return np.sqrt(np.maximum(squares, 0.0)).max(axis=0).tolist()  # a rotation about d does not change d
 
 
 def _vertical_only(
@@ -199,10 +207,20 @@ def _vertical_only(
     reason = f"no horizontal structure: best score {peak:.1f} sigma, required {limits.min_score:g}"
     if near.sum() < limits.min_lines or prior.cone_rad > 0:
         return _no_directions(len(near), reason)
-    e = upright(v)[:, :2]
-    J = lines.normal[near] @ e / residual_sigma(lines, v, limits.sigma_model)[near, None]
-    H = (J.T * lines.weight[near]) @ J + np.eye(2) / prior.sigma_rad**2
-    sigma = math.hypot(math.sqrt(float(np.trace(np.linalg.inv(H))) / 2), limits.least_sigma)
+    axes = upright(v)
+    spread = residual_sigma(lines, v, limits.sigma_model)[near]
+    J, r = lines.normal[near] @ axes[:, :2] / spread[:, None], lines.normal[near] @ v / spread
+    weighted = J.T * lines.weight[near]
+    H = weighted @ J + np.eye(2) / prior.sigma_rad**2
+    part = parts_of(lines.normal[near], lines.tangent[near], axes)
+    inside = [part == k for k in range(PARTS)]
+    if near.sum() - max(own.sum() for own in inside) < limits.min_lines:
+        return _no_directions(len(near), f"{reason}; the upright lines are in one part of the image")
+    steps = [without(H, weighted[:, own] @ J[own], weighted[:, own] @ r[own]) for own in inside]
+    by_parts = (PARTS - 1) / PARTS * float(np.square(steps).sum()) / 2
+    sigma = math.hypot(math.sqrt(max(float(np.trace(np.linalg.inv(H))) / 2, by_parts)), limits.least_sigma)
+    if sigma > prior.sigma_rad:
+        return _no_directions(len(near), f"{reason}; parts of the upright lines disagree")
     none = np.array([-1], dtype=np.int64)
     return FoundDirections(v[None], np.array([sigma]), none, np.where(near, 0, -1).astype(np.int64), reason)
 

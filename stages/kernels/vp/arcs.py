@@ -40,16 +40,16 @@ def split_all(
     most = 0
     for c in range(len(start) - 1):
         most = max(most, start[c + 1] - start[c])
-    rays = np.empty((most, 3))
+    rays, away = np.empty((3, most)), np.empty(most)
     stack = np.empty((DEEPEST, 2), dtype=np.int64)
     rows = np.empty((len(points) // (2 * TRIMMED + 3) + 1, COLUMNS))
     count = 0
     for c in range(len(start) - 1):
         size = start[c + 1] - start[c]
-        for k in range(size):
-            _ray(table, points[start[c] + k, 0], points[start[c] + k, 1], rays, k)
-            if rolls:
-                _turn(rays[k], points[start[c] + k, 1] - middle_row, turn_rad_per_row)
+        _rays(table, points[start[c] : start[c + 1]], rays)
+        if rolls:
+            for k in range(size):
+                _turn(rays, k, points[start[c] + k, 1] - middle_row, turn_rad_per_row)
         stack[0, 0], stack[0, 1] = 0, size - 1
         waiting = 1
         while waiting > 0:
@@ -57,7 +57,7 @@ def split_all(
             i, j = stack[waiting, 0], stack[waiting, 1]
             if j - i < 2 * TRIMMED + 2 or waiting + 2 > DEEPEST:
                 continue
-            split = _worst(rays, i, j, tolerance)
+            split = _worst(rays, away, i, j, tolerance)
             if split >= 0:
                 stack[waiting, 0], stack[waiting, 1] = split, j
                 stack[waiting + 1, 0], stack[waiting + 1, 1] = i, split
@@ -68,50 +68,54 @@ def split_all(
 
 
 @compiled
-def _ray(table: NDArray[np.float32], x: float, y: float, out: Array64, at: int) -> None:
-    """The ray between pixels, bilinearly interpolated in the table: error at most 3e-5 rad."""
-    x, y = x / STEP_PX, y / STEP_PX
-    column, row = np.uint64(x), np.uint64(y)  # unsigned: avoids the check for negative indices
-    right, below = column + np.uint64(1), row + np.uint64(1)
-    u, v = x - column, y - row
-    square = 0.0
-    for k in range(3):
-        top = table[row, column, k] * (1.0 - u) + table[row, right, k] * u
-        low = table[below, column, k] * (1.0 - u) + table[below, right, k] * u
-        value = top * (1.0 - v) + low * v
-        out[at, k] = value
-        square += value * value
-    scale = 1.0 / math.sqrt(square)
-    for k in range(3):
-        out[at, k] *= scale
+def _rays(table: NDArray[np.float32], points: NDArray[np.float32], out: Array64) -> None:
+    """Rays (3, ...) between pixels, bilinearly interpolated in the table: error at most 3e-5 rad."""
+    x, y, z = out[0], out[1], out[2]
+    for i in range(len(points)):
+        at_x, at_y = points[i, 0] / STEP_PX, points[i, 1] / STEP_PX
+        column, row = np.uint64(at_x), np.uint64(at_y)  # unsigned: avoids the check for negative indices
+        right, below = column + np.uint64(1), row + np.uint64(1)
+        u, v = at_x - np.float64(column), at_y - np.float64(row)
+        a, b, c, d = (1.0 - u) * (1.0 - v), u * (1.0 - v), (1.0 - u) * v, u * v
+        one, two, three, four = table[row, column], table[row, right], table[below, column], table[below, right]
+        x[i] = a * one[0] + b * two[0] + c * three[0] + d * four[0]
+        y[i] = a * one[1] + b * two[1] + c * three[1] + d * four[1]
+        z[i] = a * one[2] + b * two[2] + c * three[2] + d * four[2]
+    for i in range(len(points)):
+        scale = 1.0 / math.sqrt(x[i] * x[i] + y[i] * y[i] + z[i] * z[i])
+        x[i] *= scale
+        y[i] *= scale
+        z[i] *= scale
 
 
 @compiled
-def _turn(ray: Array64, rows: float, turn_rad: Array64) -> None:
-    """Rotate a ray by `rows` times the angle (3,), some degrees at most, to third order (Cayley's formula)."""
+def _turn(rays: Array64, k: int, rows: float, turn_rad: Array64) -> None:
+    """Rotate ray k by `rows` times the angle (3,), some degrees at most, to third order (Cayley's formula)."""
     a, b, c = 0.5 * rows * turn_rad[0], 0.5 * rows * turn_rad[1], 0.5 * rows * turn_rad[2]
-    x, y, z = ray[0], ray[1], ray[2]
+    x, y, z = rays[0, k], rays[1, k], rays[2, k]
     u, v, w = x + b * z - c * y, y + c * x - a * z, z + a * y - b * x  # the ray and h x ray
     scale = 2.0 / (1.0 + a * a + b * b + c * c)
-    ray[0] = x + scale * (b * w - c * v)
-    ray[1] = y + scale * (c * u - a * w)
-    ray[2] = z + scale * (a * v - b * u)
+    rays[0, k] = x + scale * (b * w - c * v)
+    rays[1, k] = y + scale * (c * u - a * w)
+    rays[2, k] = z + scale * (a * v - b * u)
 
 
 @compiled
-def _worst(rays: Array64, i: int, j: int, tolerance: float) -> int:
+def _worst(rays: Array64, away: Array64, i: int, j: int, tolerance: float) -> int:
     """The ray between i and j farthest from the circle through both, -1 when all are within the tolerance."""
-    nx = rays[i, 1] * rays[j, 2] - rays[i, 2] * rays[j, 1]
-    ny = rays[i, 2] * rays[j, 0] - rays[i, 0] * rays[j, 2]
-    nz = rays[i, 0] * rays[j, 1] - rays[i, 1] * rays[j, 0]
+    nx = rays[1, i] * rays[2, j] - rays[2, i] * rays[1, j]
+    ny = rays[2, i] * rays[0, j] - rays[0, i] * rays[2, j]
+    nz = rays[0, i] * rays[1, j] - rays[1, i] * rays[0, j]
     length = np.sqrt(nx * nx + ny * ny + nz * nz)
     if length < 1e-9:
         return (i + j) // 2
+    x, y, z, off = rays[0, i + 1 : j], rays[1, i + 1 : j], rays[2, i + 1 : j], away[i + 1 : j]
+    for k in range(len(off)):  # without a branch, so that several are done at once
+        off[k] = abs(nx * x[k] + ny * y[k] + nz * z[k])
     worst, at = tolerance * length, -1
-    for k in range(i + 1, j):
-        away = abs(nx * rays[k, 0] + ny * rays[k, 1] + nz * rays[k, 2])
-        if away > worst:
-            worst, at = away, k
+    for k in range(len(off)):
+        if off[k] > worst:
+            worst, at = off[k], i + 1 + k
     return at
 
 
@@ -120,7 +124,7 @@ def _fit_piece(rays: Array64, i: int, j: int, min_extent: float, least_sigma: fl
     """Fill a row of the table; False when the piece is too short."""
     xx, xy, xz, yy, yz, zz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for k in range(i, j + 1):
-        x, y, z = rays[k, 0], rays[k, 1], rays[k, 2]
+        x, y, z = rays[0, k], rays[1, k], rays[2, k]
         xx += x * x
         xy += x * y
         xz += x * z
@@ -128,7 +132,7 @@ def _fit_piece(rays: Array64, i: int, j: int, min_extent: float, least_sigma: fl
         yz += y * z
         zz += z * z
     moments = (xx, xy, xz, yy, yz, zz, float(j - i + 1))
-    first, last = (rays[i, 0], rays[i, 1], rays[i, 2]), (rays[j, 0], rays[j, 1], rays[j, 2])
+    first, last = (rays[0, i], rays[1, i], rays[2, i]), (rays[0, j], rays[1, j], rays[2, j])
     return fit_moments(moments, first, last, min_extent, least_sigma, row)
 
 

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from stages.geometry.frames import rotation_from_rpy_deg, rotation_z
-from stages.kernels.vp.directions import GATE, NONE, all_directions, upright
-from stages.vp.directions import Lines, assign, refine, residual_sigma
+from stages.kernels.vp.directions import GATE, NONE, PARTS, all_directions, parts_of, upright
+from stages.vp.directions import Lines, assign, jackknife, refine, residual_sigma
 from stages.vp.search import SearchLimits, VerticalPrior, find_structure
 from stages.vp.spectrum import peaks, yaw_spectrum
 from stages.vp.verticals import propose_verticals, refine_vertical
 
 SIGMA = np.radians(0.25)
-LIMITS = SearchLimits(SIGMA, np.radians(0.05), 0.3, 3, 4, 7.0, 2.0, 4.0)
+LIMITS = SearchLimits(SIGMA, np.radians(0.05), 0.3, 3, 4, 7.0, 2.0, 4.0, 3.0, 6.0, np.radians(15))
 UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -171,6 +171,17 @@ def test_two_horizontal_frames_are_separated_and_numbered_by_strength():
     assert list(one.frame) == [-1, 0, 0]
 
 
+def test_a_further_pair_that_stands_out_less_is_stated_as_unsure():
+    other = rotation_z(np.radians(30.0))
+    rows = np.vstack([np.eye(3), np.eye(3)[:2], other[:, :2].T])
+    limits = dataclasses.replace(LIMITS, sure_elsewhere_score=100.0)
+    found = find_structure(lines_along(rows, each=12), VerticalPrior(UP, np.radians(3), 0.0), limits)
+    assert list(found.frame) == [-1, 0, 0, 1, 1]
+    assert (np.degrees(found.sigma_rad[:3]) < 0.5).all()
+    np.testing.assert_allclose(np.degrees(found.sigma_rad[3:]), 15.0, atol=0.1)
+    assert found.reason.startswith("2 horizontal frames (1 unsure)")
+
+
 @pytest.mark.parametrize(("apart_deg", "frames"), [(3.0, {-1, 0}), (7.0, {-1, 0, 1})])
 def test_pairs_are_separated_from_some_degrees_on(apart_deg, frames):
     nearby = rotation_z(np.radians(apart_deg))
@@ -189,3 +200,54 @@ def test_random_lines_are_no_structure_and_have_a_reason():
     assert len(few.direction) == 0
     assert "too few" in few.reason
     assert list(few.line_direction) == [-1, -1]
+
+
+def without_lines(lines, drop):
+    return Lines(*(getattr(lines, field.name)[~drop] for field in dataclasses.fields(lines)))
+
+
+def test_the_jackknife_is_the_spread_of_estimates_without_one_part_of_azimuth():
+    lines = lines_along(np.eye(3), each=40, noise_deg=0.4, seed=3)
+    whole = refine(lines, np.eye(3), np.zeros(1), UP, np.radians(3), SIGMA, 30)
+    part = parts_of(lines.normal, lines.tangent, whole.axes)
+    assert set(part) == set(range(PARTS))
+    expected = np.zeros((3, 3))
+    for k in range(PARTS):
+        other = refine(without_lines(lines, part == k), whole.axes, np.zeros(1), UP, np.radians(3), SIGMA, 30)
+        turn = whole.axes.T @ other.axes
+        step = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2
+        expected += (PARTS - 1) / PARTS * np.outer(step, step)
+    found = jackknife(lines, whole, SIGMA)
+    np.testing.assert_allclose(np.sqrt(np.diag(found)), np.sqrt(np.diag(expected)), rtol=0.3)
+
+
+def leaning(azimuth_deg, lean_deg, each, seed):
+    """Lines along a direction `lean_deg` off the vertical, all in the image of one object at an azimuth."""
+    rng = np.random.default_rng(seed)
+    azimuth, lean = np.radians(azimuth_deg), np.radians(lean_deg)
+    d = np.array([-np.sin(lean) * np.sin(azimuth), np.sin(lean) * np.cos(azimuth), np.cos(lean)])
+    normals, tangents = [], []
+    for at in azimuth + rng.normal(0, 0.05, each):
+        middle = np.array([np.cos(at), np.sin(at), rng.uniform(0.2, 1.0)])
+        middle /= np.linalg.norm(middle)
+        n = np.cross(d, middle) / np.linalg.norm(np.cross(d, middle))
+        normals.append(n)
+        tangents.append(np.cross(n, middle))
+    return Lines(np.array(normals), np.array(tangents), np.full(each, np.radians(0.1)), np.ones(each))
+
+
+def test_a_vertical_on_which_parts_of_the_image_disagree_has_a_larger_sigma_or_is_not_stated():
+    poles = lines_along(np.eye(3)[2:], each=6, noise_deg=0.1, seed=2)
+    prior = VerticalPrior(UP, np.radians(3), 0.0)
+    alone = find_structure(poles, prior, LIMITS)
+    assert list(alone.frame) == [-1]
+    assert np.degrees(alone.sigma_rad[0]) < 0.6
+    for lean_deg, each in ((1.2, 8), (2.0, 8), (0.9, 3)):
+        streaks = leaning(70.0, lean_deg, each, seed=4)
+        fields = [field.name for field in dataclasses.fields(Lines)]
+        both = Lines(*(np.concatenate([getattr(poles, name), getattr(streaks, name)]) for name in fields))
+        found = find_structure(both, prior, LIMITS)
+        assert not len(found.direction) or off_deg(UP, found.direction[0]) < 3 * np.degrees(found.sigma_rad[0])
+    assert "parts" in found.reason or found.sigma_rad[0] > 1.5 * alone.sigma_rad[0]
+    apart = find_structure(leaning(70.0, 0.0, 20, seed=4), prior, LIMITS)
+    assert "one part of the image" in apart.reason

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
-from stages.kernels.vp.edges import LEVELS, SOBEL_GAIN, thresholds
+from stages.kernels.vp.edges import BINS, LEVELS, SLOPE, slopes_and_seeds, thresholds
 from stages.vp.edges import EdgeFinder
 
 
@@ -29,8 +30,8 @@ def test_an_edge_is_found_to_a_tenth_of_a_pixel_at_any_angle():
         offset = 3.3
         chains = chains_of(half_plane(angle_deg, offset))
         assert len(chains.start) == 2, angle_deg
-        angle = np.radians(angle_deg)
-        away = (chains.points_px - 59.5) @ [np.cos(angle), np.sin(angle)] - offset
+        angle = np.radians(angle_deg)  # arcs omit the end points as well
+        away = (chains.points_px[1:-1] - 59.5) @ [np.cos(angle), np.sin(angle)] - offset
         assert abs(away.mean()) < 0.06
         assert np.abs(away).max() < 0.25
         assert len(away) > 50
@@ -52,11 +53,35 @@ def test_noise_has_no_chains_and_sets_its_own_threshold():
 
 
 def test_the_threshold_is_the_contrast_setting_without_noise():
-    grey = np.full((64, 64), 100, dtype=np.uint8)
-    flat = np.zeros((64, 64), dtype=np.int16)
-    limit = thresholds(grey, flat, flat, np.ones((64, 64), dtype=np.uint8), 8.0)
+    counts = np.zeros((LEVELS, BINS), dtype=np.int64)
+    counts[6, 0] = 1000
+    limit = thresholds(counts, 8.0)
     assert limit.shape == (LEVELS,)
-    np.testing.assert_allclose(np.sqrt(limit), 8.0 * SOBEL_GAIN, rtol=1e-6)
+    np.testing.assert_allclose(np.sqrt(limit), 8.0 * SLOPE, rtol=1e-6)
+
+
+def test_the_gradient_is_that_of_a_5_x_5_sobel_inside_the_spans():
+    grey = np.random.default_rng(5).integers(0, 256, (40, 50)).astype(np.uint8)
+    span = np.zeros((40, 2), dtype=np.int64)
+    span[5:30] = 7, 41
+    slopes, seeds = np.zeros(grey.shape, dtype=np.int32), np.empty(400, dtype=np.int64)
+    rows = (np.empty(50, dtype=np.int16), np.empty(50, dtype=np.int16))
+    slopes_and_seeds(grey, np.ones_like(grey), span, 0.0, slopes, *rows, seeds)
+    for found, order in ((slopes.astype(np.int16) & ~1, (1, 0)), (slopes >> 16, (0, 1))):
+        sobel = cv2.Sobel(grey, cv2.CV_16S, *order, ksize=5)[5:30, 7:41]
+        np.testing.assert_allclose(found[5:30, 7:41], sobel, atol=order[0])  # its last bit says whether it is free
+        assert not found[:5].any()
+        assert not found[:, 41:].any()
+
+
+def test_a_seed_lies_on_each_straight_run_of_seven_pixels():
+    for angle_deg in (0, 45, 90, 135):
+        grey = half_plane(angle_deg, 0.0)
+        for along in range(-30, 30):
+            x, y = np.round(59.5 + along * np.array([-np.sin(np.radians(angle_deg)), np.cos(np.radians(angle_deg))]))
+            usable = np.zeros(grey.shape, dtype=np.uint8)
+            usable[int(y) - 4 : int(y) + 4, int(x) - 4 : int(x) + 4] = 1
+            assert len(chains_of(grey, usable, min_points=1).points_px) >= 2, (angle_deg, along)
 
 
 def test_weak_edges_and_masked_pixels_give_no_chain():

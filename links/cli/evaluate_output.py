@@ -134,7 +134,7 @@ def compare_and_show(own: list[Evaluation], others: list[Evaluation], keys: list
 def show_tables(files: list[Path], keys: list[Key]) -> None:
     """Print the tables over all runs of Parquet files, without reading the runs again."""
     runs = pd.concat([read_parquet(file) for file in files], ignore_index=True)
-    primary = runs.drop_duplicates(["run", "drone"])  # the first output of each run
+    primary = runs.query("primary == 1")
     flights, empty = primary.query("no_drone == 0"), primary.query("no_drone == 1")
     tables = [group_table(flights, key) for key in keys or [()] if len(flights)]
     for table in [*tables, *([false_track_table(empty)] if len(empty) else [])]:

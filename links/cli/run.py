@@ -162,7 +162,7 @@ def replay_recording(
         if as_live or expect is not None or view:
             raise LinkError("--as-live, --expect and --view are for one recording: leave them out")
         request = RunRequest(config or DEFAULT_REPLAY_CONFIG, tuple(overlay or ()), tuple(sets or ()))
-        _replay_all(recordings, request, out_dir or Path("out"), scheduler or jobs, hashed)
+        _replay_all(recordings, request, out_dir or Path("out"), scheduler or jobs, single_process, hashed)
         return
     recording = recordings[0]
     if as_live:
@@ -180,9 +180,11 @@ def replay_recording(
         raise typer.Exit(EXIT_FAILED)
 
 
-def _replay_all(recordings: list[Path], request: RunRequest, out_dir: Path, workers: Workers, hashed: bool) -> None:
+def _replay_all(
+    recordings: list[Path], request: RunRequest, out_dir: Path, workers: Workers, single_process: bool, hashed: bool
+) -> None:
     with progress_bar(f"replay {len(recordings)} recordings") as step:
-        outcomes = replay_all(recordings, request, out_dir, workers, step, hashed=hashed)
+        outcomes = replay_all(recordings, request, out_dir, workers, step, single_process=single_process, hashed=hashed)
     for outcome in outcomes:
         (err if outcome.failure else out).print(str(outcome), markup=False, style="red" if outcome.failure else "")
     if any(outcome.failure for outcome in outcomes):

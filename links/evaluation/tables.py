@@ -70,6 +70,7 @@ def runs_table(evaluations: Sequence[Evaluation]) -> pd.DataFrame:
     about = pd.DataFrame({"recording": [e.run.recording for e in evaluations]})
     about["config"] = [e.run.config for e in evaluations]
     about["output"] = [e.output.kind.value for e in evaluations]
+    about["primary"] = [int(e.output is e.run.outputs[0]) for e in evaluations]
     about["drone"] = [e.run.drone for e in evaluations]
     about["run"] = [e.run.name for e in evaluations]
     about["no_drone"] = [int(e.run.no_drone) for e in evaluations]

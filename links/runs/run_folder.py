@@ -255,6 +255,7 @@ class ReplayTask:
     folder: Path
     request: RunRequest
     hashed: bool
+    single_process: bool
 
 
 @dataclass(frozen=True)
@@ -280,26 +281,42 @@ def replay_all(
     workers: Workers,
     progress: Callable[[float, float], None],
     *,
+    single_process: bool = False,
     hashed: bool = True,
 ) -> list[ReplayOutcome]:
-    """Replay into `out_dir/<recording>-<configuration>`. LinkError: two recordings have one name."""
+    """Replay into `out_dir/<recording>-<configuration>`. LinkError: two recordings have one name.
+
+    `single_process`, `hashed`: as in `replay_into`.
+    """
     twice = [name for name, count in Counter(path.stem for path in recordings).items() if count > 1]
     if twice:
         raise LinkError(f"several recordings are named {twice[0]}: their runs would share a folder; give each --out")
-    tasks = [ReplayTask(path, out_dir / f"{path.stem}-{request.config.stem}", request, hashed) for path in recordings]
+    tasks = [
+        ReplayTask(path, out_dir / f"{path.stem}-{request.config.stem}", request, hashed, single_process)
+        for path in recordings
+    ]
     return run_all(replay_one, tasks, workers, lambda shares: progress(sum(shares), len(tasks)))
 
 
 def replay_one(task: ReplayTask, report: Callable[[float], None]) -> ReplayOutcome:
-    """Replay one recording, unless its folder holds the run."""
+    """Replay one recording, unless its folder holds the run. A folder with another run is not changed."""
     try:
         graph = task.request.graph(Session(task.recording).rig_yaml, f"{task.recording} (rig.yaml)")
         if holds_run(task.folder, task.recording, graph):
             summary = json.loads((task.folder / SUMMARY_FILE).read_text(encoding="utf-8"))
-            if summary["output_hash"] is not None or not task.hashed:
-                return ReplayOutcome(task.recording, task.folder, summary["output_hash"], kept=True)
+            return ReplayOutcome(task.recording, task.folder, summary["output_hash"], kept=True)
+        if (task.folder / SUMMARY_FILE).exists():
+            raise LinkError(
+                f"{task.folder} has a run with other settings, or of an older recording: name another --out, or remove "
+                "it first"
+            )
         result = replay_into(
-            task.folder, task.recording, task.request, lambda done, whole: report(done / whole), hashed=task.hashed
+            task.folder,
+            task.recording,
+            task.request,
+            lambda done, whole: report(done / whole),
+            single_process=task.single_process,
+            hashed=task.hashed,
         )
     except (LinkError, ConfigError, RunError, OSError) as error:
         return ReplayOutcome(task.recording, task.folder, failure=str(error))

@@ -5,9 +5,10 @@ vehicle drives, as an EKF requires, in axes that point as the autopilot's own di
 
     p_sent = Rz(axes_yaw)^T p_map,   R_sent_drone = Rz(axes_yaw)^T R_map_drone
 
-axes_yaw is constant, so that an error of the autopilot's heading at that time turns the axes and adds no error to a
-pose in them. Then a switch between its own sources and grd turns neither its attitude nor its velocity by more than
-that heading has changed since. The frame is LOCAL_FRD, not LOCAL_NED: the yaw is not relative to the true north.
+axes_yaw is constant, so that its error turns the axes against north and adds no error to a pose in them. The axes stay
+parallel to those of the autopilot's position and velocity unless its EKF resets its yaw, so a switch between its own
+sources and grd turns its attitude by the error of its compass at most. The frame is LOCAL_FRD, not LOCAL_NED: the yaw
+is not relative to the true north.
 Positions without yaw: `position_messages.py`. LANDING_TARGET contains the vehicle's position in the drone's body frame.
 
     p_drone_vehicle = -R_vehicle_drone^T t_vehicle_drone

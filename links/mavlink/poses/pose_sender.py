@@ -5,7 +5,8 @@
     none      a position in the autopilot's own axes; its yaw comes from its compass. It needs no rotation of the drone
     measured  a pose with yaw, while cameras or the raw IMU measure it; its yaw comes from grd alone. The axes are
               parallel to the autopilot's own when the first pose since its boot is sent, by its motion if that shows
-              them within the limit, else by its attitude; without an attitude they are those of `map`. They are kept
+              them within the limit, else by its attitude; without an attitude they are those of `map`. They are kept.
+              After a restart in flight the attitude contains earlier poses: it chooses the axes, and measures nothing
 
 The reset counter is incremented with every jump of the pose, every change of the drone, and after every pause that the
 autopilot noticed, so that it resets to the new pose instead of gating it. Its initial value is arbitrary: after a
@@ -13,7 +14,8 @@ restart of grd it should differ from the previous one.
 
 Texts: `status_texts.py`. Rejection of the pose by the autopilot: `fusion_monitor.py`.
 
-Source: ours; ArduPilot AP_VisualOdom (300 ms health), PX4 EKF2 EV_MAX_INTERVAL (200 ms to start, 400 ms to stop).
+Source: ours; ArduPilot AP_VisualOdom (300 ms health), AP_AHRS::attitudes_consistent (20 deg of yaw); PX4 EKF2
+EV_MAX_INTERVAL (200 ms to start, 400 ms to stop).
 """
 
 from __future__ import annotations
@@ -38,7 +40,7 @@ from stages.messages import PoseState, RelativePose
 
 PoseMessage = Literal["odometry", "vision_position_estimate", "landing_target"]
 
-MAX_COMPASS_RAD = math.radians(20.0)  # ours, chosen: 30 deg let the position loop of the simulated autopilot oscillate
+MAX_COMPASS_RAD = math.radians(20.0)  # as between ArduPilot's estimators before arming: ATTITUDE_CHECK_THRESH_YAW_RAD
 POSE_TIMEOUT_NS = 300_000_000  # the autopilot's timeout for poses
 
 

@@ -13,7 +13,6 @@ Source: ours.
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +25,7 @@ from flow.message import Message
 from links.runs.request import RunRequest
 from links.runs.shipped import shipped
 from links.simulated.matrix.cue_table import ALL, CONFIG, GNSS, OFF_M
-from links.simulated.matrix.flight_lines import flights_parser, flown
+from links.simulated.matrix.flight_lines import flights_parser, flown, write_table
 from links.simulated.rig.closed_loop import ClosedLoop
 from links.simulated.rig.run import Simulation
 from links.simulated.rig.scenario import Scenario, load_scenario
@@ -176,9 +175,7 @@ def main() -> None:
         for seed in range(arguments.first_seed, arguments.first_seed + arguments.seeds)
         for variant in arguments.variants
     ]
-    table = table_of(flown(arguments.folder, flights, fly, arguments.jobs))
-    (arguments.folder / "table.md").write_text(table + "\n", encoding="utf-8")
-    sys.stdout.write(table + "\n")
+    write_table(arguments.folder, table_of(flown(arguments.folder, flights, fly, arguments.jobs)))
 
 
 if __name__ == "__main__":

@@ -18,9 +18,7 @@ from __future__ import annotations
 import itertools
 import math
 import re
-import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -30,8 +28,8 @@ from flow.link import LinkError, Tap
 from flow.message import Message
 from links.runs.request import RunRequest
 from links.runs.shipped import shipped
-from links.simulated.matrix.flight_lines import flights_parser, flown
-from links.simulated.matrix.flights import CAMERA_HEIGHT_M, Cell
+from links.simulated.matrix.flight_lines import CellFlight, flights_parser, flown, write_table
+from links.simulated.matrix.flights import CAMERA_HEIGHT_M
 from links.simulated.matrix.matrix import Conditions, cells, scenario_of
 from links.simulated.rig.closed_loop import ClosedLoop
 from links.simulated.rig.run import Simulation
@@ -74,20 +72,6 @@ SETS = (
     "links.viewer=null",
     f"stages.cues.config.altitude.home_up_m={-CAMERA_HEIGHT_M}",
 )
-
-
-@dataclass(frozen=True)
-class Flight:
-    """One flight to simulate."""
-
-    cell: Cell
-    seed: int
-    variant: str
-
-    @property
-    def name(self) -> str:
-        """Of the cell."""
-        return self.cell.name
 
 
 class AcceptanceTap(Tap):
@@ -167,7 +151,7 @@ def by_cues(log_odds: float, reason: str) -> bool:
     return cues is not None and log_odds - float(cues[1]) < ACCEPT_NATS
 
 
-def fly(flight: Flight, progress: Callable[[float], None]) -> dict[str, Any] | None:
+def fly(flight: CellFlight[str], progress: Callable[[float], None]) -> dict[str, Any] | None:
     """Simulate one flight. None: the scene of the seed does not allow it."""
     cues = VARIANTS[flight.variant]
     conditions = Conditions(autopilot=True, odometry=True, calibrated=True, sparse=True, varied_sky=True)
@@ -237,15 +221,13 @@ def main() -> None:
     parser.add_argument("--variants", nargs="*", default=list(VARIANTS), choices=list(VARIANTS))
     arguments = parser.parse_args()
     flights = [
-        Flight(cell, seed, variant)
+        CellFlight(cell, seed, variant)
         for cell in cells(arguments.only or ["*"], arguments.pairs)
         for seed in range(arguments.first_seed, arguments.first_seed + arguments.seeds)
         for variant in arguments.variants
         if "another" not in variant or cell.motion == "two"
     ]
-    table = table_of(flown(arguments.folder, flights, fly, arguments.jobs))
-    (arguments.folder / "table.md").write_text(table + "\n", encoding="utf-8")
-    sys.stdout.write(table + "\n")
+    write_table(arguments.folder, table_of(flown(arguments.folder, flights, fly, arguments.jobs)))
 
 
 if __name__ == "__main__":

@@ -7,11 +7,14 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 from flow.jobs import Workers, run_all
+from links.simulated.matrix.flights import Cell
 
 FILE = "flights.jsonl"
 Row = dict[str, Any]  # cell, seed, variant, and what a table needs
@@ -36,6 +39,23 @@ class Flight(Protocol):
         ...
 
 
+V = TypeVar("V", bound=str)
+
+
+@dataclass(frozen=True)
+class CellFlight(Generic[V]):
+    """A flight of a cell of the matrix."""
+
+    cell: Cell
+    seed: int
+    variant: V
+
+    @property
+    def name(self) -> str:
+        """Of the cell."""
+        return self.cell.name
+
+
 F = TypeVar("F", bound=Flight)
 
 
@@ -56,6 +76,12 @@ def flown(
                 with file.open("a", encoding="utf-8") as stream:
                     stream.write(json.dumps(row) + "\n")
     return rows
+
+
+def write_table(folder: Path, table: str) -> None:
+    """Write table.md into `folder`, and print it."""
+    (folder / "table.md").write_text(table + "\n", encoding="utf-8")
+    sys.stdout.write(table + "\n")
 
 
 def flights_parser(description: str | None, cells: bool = True) -> argparse.ArgumentParser:

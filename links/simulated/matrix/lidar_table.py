@@ -14,9 +14,7 @@ Source: ours.
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from statistics import median_low
 from typing import Any
@@ -27,33 +25,18 @@ from flow.link import LinkError, Tap
 from flow.message import Message
 from links.runs.request import RunRequest
 from links.runs.shipped import shipped
-from links.simulated.matrix.flight_lines import flights_parser, flown
-from links.simulated.matrix.flights import Cell
+from links.simulated.matrix.flight_lines import CellFlight, flights_parser, flown, write_table
 from links.simulated.matrix.matrix import Conditions, cells, scenario_of
 from links.simulated.rig.closed_loop import ClosedLoop
 from links.simulated.rig.run import Simulation
 from links.simulated.world.scene import Truth
-from stages.geometry.lidar_models import LIDAR_MODELS, LidarModel
+from stages.geometry.lidar_models import LIDAR_MODELS
 from stages.messages import DroneFix
 
 NEAR_M = 1.0  # as `grd evaluate`
 AFTER_S = 5.0
 CONFIG = Path("configs/estimate.yaml")
 SETS = ("stages.fuse=null", "stages.drone_motion=null", "links.viewer=null")
-
-
-@dataclass(frozen=True)
-class Flight:
-    """One flight to simulate."""
-
-    cell: Cell
-    seed: int
-    variant: LidarModel
-
-    @property
-    def name(self) -> str:
-        """Of the cell."""
-        return self.cell.name
 
 
 class FixTap(Tap):
@@ -83,7 +66,7 @@ class FixTap(Tap):
             self.first_fix_s = (message.stamp_ns - truth.start_ns) * 1e-9
 
 
-def fly(flight: Flight, progress: Callable[[float], None]) -> dict[str, Any] | None:
+def fly(flight: CellFlight[LidarModel], progress: Callable[[float], None]) -> dict[str, Any] | None:
     """Simulate one flight. None: the scene of the seed does not allow it."""
     conditions = Conditions(
         autopilot=True, odometry=True, calibrated=True, perturbed=True, sparse=True, lidar=flight.variant
@@ -143,14 +126,12 @@ def main() -> None:
     parser.add_argument("--models", nargs="*", default=list(LIDAR_MODELS), choices=list(LIDAR_MODELS))
     arguments = parser.parse_args()
     flights = [
-        Flight(cell, seed, model)
+        CellFlight(cell, seed, model)
         for seed in range(arguments.first_seed, arguments.first_seed + arguments.seeds)
         for cell in cells(arguments.only or ["*"], arguments.pairs)
         for model in arguments.models
     ]
-    table = table_of(flown(arguments.folder, flights, fly, arguments.jobs))
-    (arguments.folder / "table.md").write_text(table + "\n", encoding="utf-8")
-    sys.stdout.write(table + "\n")
+    write_table(arguments.folder, table_of(flown(arguments.folder, flights, fly, arguments.jobs)))
 
 
 if __name__ == "__main__":

@@ -174,6 +174,9 @@ def test_several_recordings_are_replayed_on_processes_and_complete_runs_are_kept
     assert text.count(": made, output hash") == 2
     assert "broken.mcap: " in text
     assert grd(*several, code=1).count(": kept, output hash") == 2
+    before = (tmp_path / "runs" / "one-replay" / "summary.json").read_bytes()
+    assert grd(*several, "--set", "track.frame_s=0.1", code=1).count("has a run with other settings") == 2
+    assert (tmp_path / "runs" / "one-replay" / "summary.json").read_bytes() == before
     assert "for one recording" in grd("replay", "one.mcap", "two.mcap", "--expect", "0" * 16, code=2)
     assert "several recordings are named one" in grd("replay", "one.mcap", tmp_path / "one.mcap", code=2)
 

@@ -292,6 +292,8 @@ def test_a_parquet_table_gives_the_same_tables_as_the_runs(two_configs, tmp_path
     assert [row for row in rows if row not in of_runs] == []
     more = read_parquet(file)
     assert len(more) == len(all_evaluated(*two_configs, empty))
+    twice = grd("evaluate", file, file, "--by", "config")  # as of two folders with runs of the same names
+    assert re.search(r"paper +│ +4 │", twice)
     assert "give tables alone" in grd("evaluate", file, two_configs[0], code=2)
     assert "give tables alone" in grd("evaluate", file, "--csv", tmp_path / "a.csv", code=2)
 

@@ -7,9 +7,9 @@ of the candidate, p_0: density of z for an object anywhere within the search ran
 1 / R for each scalar, e: probability that a cue is of another object. Of the newest three measurements of a cue the
 median counts: a single reflection changes nothing. A cue that contradicts the candidate removes what the others add.
 
-A wrong cue can be exactly where a lamp is: its position shows nothing. Only what a cue of `shown` adds may have a
+A wrong cue can be exactly where a lamp is: its position shows nothing. Only what a cue of `proven` adds may have a
 candidate accepted: one that has agreed with the drone before (`bias.py`), or that moves as the candidate does. With d0
-the change of the residual to an object that stands where the candidate is, d1 that to the candidate, S0 and S1 their
+the change of the residual to a static object where the candidate is, d1 that to the candidate, S0 and S1 their
 covariances:  d0' S0^-1 d0 > chi2(99.9 %),  d1' S1^-1 d1 < chi2(99 %),  and the sigma of S1 below half of d0.
 Even then the caps hold: with the largest sum a candidate must reach 72 % by the LiDAR alone.
 
@@ -75,7 +75,7 @@ class CueNats(NamedTuple):
     """What all cues add to the log-odds that an object is the drone."""
 
     total: float
-    of_shown: float  # without what cues add that have not shown that they are of it
+    of_proven: float  # without what the other cues than the proven ones add
     remark: str  # for people; empty: no cue
 
 
@@ -139,7 +139,7 @@ class CueEvidence:
                 cue.newest.clear()
                 cue.before.clear()
 
-    def shown(self, path: ObjectPath, trail: VehicleTrajectory) -> set[str]:
+    def proven(self, path: ObjectPath, trail: VehicleTrajectory) -> set[str]:
         """The cues that may have this object accepted: confirmed by the LiDAR before, or moving as it does."""
         return {
             source
@@ -147,8 +147,8 @@ class CueEvidence:
             if cue.bias.trusted and (cue.bias.confirmed or moves_as(path, cue.before, trail))
         }
 
-    def nats(self, c: ObjectState, trail: VehicleTrajectory, now_ns: int, shown: Collection[str] = ()) -> CueNats:
-        """What all cues add to the log-odds that an object is the drone; `shown`: see there."""
+    def nats(self, c: ObjectState, trail: VehicleTrajectory, now_ns: int, proven: Collection[str] = ()) -> CueNats:
+        """What all cues add to the log-odds that an object is the drone; `proven`: of the cues with these sources."""
         by_source: dict[str, float] = {}
         for source, cue in self._cues.items():
             recent = [z for z in cue.newest if now_ns - z.stamp_ns < OLDEST_NS]
@@ -156,9 +156,9 @@ class CueEvidence:
                 by_source[source] = median_low([self._nats(z, cue.bias, trail, c) for z in recent])
         if not by_source:
             return NO_CUE
-        of_shown = {source: nats if source in shown else min(nats, 0.0) for source, nats in by_source.items()}
+        of_proven = {source: nats if source in proven else min(nats, 0.0) for source, nats in by_source.items()}
         remark = ", ".join(f"{source} {nats:+.1f}" for source, nats in by_source.items())
-        return CueNats(self._sum(by_source), self._sum(of_shown), remark)
+        return CueNats(self._sum(by_source), self._sum(of_proven), remark)
 
     def _sum(self, by_source: dict[str, float]) -> float:
         total, lowest = min(sum_in_order(by_source.values()), self._weights.max_sum), min(by_source.values())
@@ -175,7 +175,7 @@ class CueEvidence:
 
 
 def moves_as(path: ObjectPath, cues: Sequence[DroneCue], trail: VehicleTrajectory) -> bool:
-    """Whether a cue moves as the object does, and as none that stands; by two measurements while it was observed."""
+    """Whether a cue moves as the object does, and as no static one; by two measurements while it was observed."""
     known = [cue for cue in cues if path.stamps_ns[0] <= cue.stamp_ns <= path.stamps_ns[-1] + AFTER_PATH_NS]
     if len(known) < 2:
         return False

@@ -103,7 +103,7 @@ class Candidate:
     own_log_odds: float = 0.0  # without cues
     cue_nats: float | None = None  # what cues add to it; None: no cue yet
     cue_ns: int = 0  # when that was computed
-    cues_shown: set[str] = field(default_factory=set[str])  # cues that have shown that they are of it
+    proven_cues: set[str] = field(default_factory=set[str])  # sources of the cues that are proven to be of it
     reason: str = ""  # for people
     alternative: Alternative | None = None  # the most probable one; None: not classified yet
     rejection: str = ""  # the alternative and the kinds of reasons for it, for people

@@ -300,11 +300,11 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
     def _add_cues(self, now: _State, c: Candidate) -> None:
         """Add the evidence of cues to the log-odds: their lowest of the last seconds, so that a short match is none.
 
-        A cue is of one object: it adds nothing to others while it matches an accepted candidate. What cues add that
-        have not shown that they are of this candidate ends below the threshold of acceptance.
+        A cue is of one object: it adds nothing to others while it matches an accepted candidate. What the cues
+        add that are not proven to be of this candidate ends below the threshold of acceptance.
         """
         state = _object(c)
-        nats, of_shown, remark = now.cues.nats(state, now.trail, c.stamp_ns, c.cues_shown)
+        nats, of_proven, remark = now.cues.nats(state, now.trail, c.stamp_ns, c.proven_cues)
         if not remark:
             c.cue_nats = None
             return
@@ -315,10 +315,10 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
             nats = min(nats, c.cue_nats + self.settings.cues.recovery_nats_per_s * since_s)
         c.cue_nats, c.cue_ns = nats, c.stamp_ns
         ceiling = max(log_odds_of(self.settings.accept_probability) - CUE_MARGIN_NATS - c.log_odds, 0.0)
-        if nats > max(of_shown, ceiling) and c.scan_passes >= CUE_PASSES:
-            c.cues_shown |= now.cues.shown(ObjectPath(c.path_ns, c.path_m, scatter_m(c.range_m)), now.trail)
-            of_shown = now.cues.nats(state, now.trail, c.stamp_ns, c.cues_shown).of_shown
-        nats = min(nats, max(of_shown, ceiling) if c.scan_passes >= CUE_PASSES else ceiling)
+        if nats > max(of_proven, ceiling) and c.scan_passes >= CUE_PASSES:
+            c.proven_cues |= now.cues.proven(ObjectPath(c.path_ns, c.path_m, scatter_m(c.range_m)), now.trail)
+            of_proven = now.cues.nats(state, now.trail, c.stamp_ns, c.proven_cues).of_proven
+        nats = min(nats, max(of_proven, ceiling) if c.scan_passes >= CUE_PASSES else ceiling)
         observed = min(c.log_odds, log_odds_of(self.settings.follow_up_probability))
         c.log_odds = max(c.log_odds + nats, observed)  # a wrong cue does not end the observation of the drone
         c.reason += f"; cues {nats:+.1f} ({remark})"

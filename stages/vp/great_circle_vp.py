@@ -8,8 +8,8 @@ On the drone, gravity is the autopilot's tilt. Without it, gravity is the mount'
 point is corrected to the exposure of the middle row with the angular rate of the mount: `tilt` on the drone,
 `motion` on the vehicle. An image without enough straight lines gives no directions, and a reason.
 
-The scores of further pairs and the least and unsure sigma were chosen on renders of three real panoramas; a fourth was
-kept back: tests/benchmarks/accuracy/bench_vp_panoramas.py. An unsure pair, of which one in five is false there, serves
+The scores of further pairs and the least and weak sigma were chosen on renders of three real panoramas; a fourth was
+kept back: tests/benchmarks/accuracy/bench_vp_panoramas.py. A weak pair, of which one in five is false there, serves
 `align`, which weighs its lines against those of the other camera.
 
 Source: ours, for P IV and V.C; DESIGN, The graph: vp.
@@ -66,9 +66,9 @@ class GreatCircleVpSettings(Settings):
     min_score: float = Field(7.0, gt=0)  # in standard deviations above lines of random directions
     min_direction_score: float = Field(2.0, ge=-100)  # of each direction of a further pair, in the same units
     min_elsewhere_score: float = Field(4.0, ge=-100)  # of a further pair without the lines of any 90 deg of azimuth
-    sure_direction_score: float = Field(3.0, ge=-100)  # a further pair with less is unsure: of one object, maybe
-    sure_elsewhere_score: float = Field(6.0, ge=-100)
-    unsure_sigma_deg: float = Field(15.0, ge=0, le=60)  # of the directions of an unsure pair
+    confident_direction_score: float = Field(3.0, ge=-100)  # a further pair with less is weak: perhaps of one object
+    confident_elsewhere_score: float = Field(6.0, ge=-100)
+    weak_sigma_deg: float = Field(15.0, ge=0, le=60)  # of the directions of a weak pair
     least_sigma_deg: float = Field(0.15, gt=0, le=5)  # beyond that of the lines: buildings are not exactly square
 
     @model_validator(mode="after")
@@ -152,9 +152,9 @@ class GreatCircleVp(Stage[GreatCircleVpSettings]):
             settings.min_score,
             settings.min_direction_score,
             settings.min_elsewhere_score,
-            settings.sure_direction_score,
-            settings.sure_elsewhere_score,
-            math.radians(settings.unsure_sigma_deg),
+            settings.confident_direction_score,
+            settings.confident_elsewhere_score,
+            math.radians(settings.weak_sigma_deg),
         )
 
     def _message(

@@ -54,9 +54,9 @@ class SearchLimits:
     min_score: float
     min_direction_score: float
     min_elsewhere_score: float
-    sure_direction_score: float
-    sure_elsewhere_score: float
-    unsure_sigma: float
+    confident_direction_score: float
+    confident_elsewhere_score: float
+    weak_sigma: float
 
 
 @dataclass(frozen=True)
@@ -90,12 +90,12 @@ def find_structure(lines: Lines, prior: VerticalPrior, limits: SearchLimits) -> 
         is_rival = abs(float(other.axes[:, 2] @ pairs[0].axes[:, 2])) < math.cos(RIVAL_RAD)
         if is_rival and other.agreement > RIVAL_SHARE * pairs[0].agreement:
             return _no_directions(m, "ambiguous: two verticals fit the lines about equally well; connect an attitude")
-    yaws, sure, peak = _frames(lines, pairs[0].axes, limits)
+    yaws, confident, peak = _frames(lines, pairs[0].axes, limits)
     if not yaws:
         vertical = verticals[0] if len(verticals) == 1 else pairs[0].axes[:, 2]
         return _vertical_only(lines, vertical, prior, limits, peak)
     structure = refine(lines, pairs[0].axes, np.array(yaws), prior.up, prior.sigma_rad, limits.sigma_model)
-    return _directions_of(lines, structure, sure, limits)
+    return _directions_of(lines, structure, confident, limits)
 
 
 def _best_pair(lines: Lines, vertical: Array64, prior: VerticalPrior, limits: SearchLimits) -> Structure:
@@ -118,13 +118,13 @@ def _along_vertical(lines: Lines, vertical: Array64, limits: SearchLimits) -> ND
 def _frames(lines: Lines, axes: Array64, limits: SearchLimits) -> tuple[list[float], list[bool], float]:
     """Yaws of the significant horizontal pairs relative to `axes`, the axes of the best pair.
 
-    Also returns whether each is sure, and the score of the first. A further pair must stand out without the lines of
-    any 90 deg of azimuth, in which a board, a car or a shelf lies; and each of its directions by itself: an object such
-    as a shadow edge has one direction only.
+    Also returns whether each is confident, and the score of the first. A further pair must be significant without the
+    lines of any 90 deg of azimuth, in which a board, a car or a shelf lies; and each of its directions by itself: an
+    object such as a shadow edge has one direction only. One that is less so is weak: not confident, but kept.
     """
     free = ~_along_vertical(lines, axes[:, 2], limits)
     yaws: list[float] = []
-    sure: list[bool] = []
+    confident: list[bool] = []
     rejected: list[float] = []
     first_score = 0.0
     while len(yaws) < limits.max_frames and len(rejected) < MAX_REJECTED:
@@ -144,11 +144,13 @@ def _frames(lines: Lines, axes: Array64, limits: SearchLimits) -> tuple[list[flo
         direction, elsewhere = pair_support(lines, axes, free, limits.sigma_model, yaw) if yaws else (np.inf, np.inf)
         if direction >= limits.min_direction_score and elsewhere >= limits.min_elsewhere_score:
             yaws.append(yaw)
-            sure.append(direction >= limits.sure_direction_score and elsewhere >= limits.sure_elsewhere_score)
+            confident.append(
+                direction >= limits.confident_direction_score and elsewhere >= limits.confident_elsewhere_score
+            )
         else:
             rejected.append(yaw)
         free = free & ~near
-    return yaws, sure, first_score
+    return yaws, confident, first_score
 
 
 def _near(lines: Lines, axes: Array64, yaw: float, limits: SearchLimits) -> NDArray[np.bool_]:
@@ -156,7 +158,7 @@ def _near(lines: Lines, axes: Array64, yaw: float, limits: SearchLimits) -> NDAr
     return assign(lines, directions, 2.0 * limits.sigma_model)[0] >= 0
 
 
-def _directions_of(lines: Lines, s: Structure, sure: list[bool], limits: SearchLimits) -> FoundDirections:
+def _directions_of(lines: Lines, s: Structure, confident: list[bool], limits: SearchLimits) -> FoundDirections:
     """The directions that have lines; sigmas by the larger of information matrix and jackknife, with `least_sigma`."""
     directions = all_directions(s.axes, s.yaw_rad)
     counts = np.bincount(s.assigned[s.assigned >= 0], minlength=len(directions))
@@ -174,13 +176,13 @@ def _directions_of(lines: Lines, s: Structure, sure: list[bool], limits: SearchL
         number[k] = len(rows)
         rows.append(d)
         frames.append(f)
-        sigmas.append(math.hypot(sigma[k], limits.least_sigma, 0.0 if f < 0 or sure[f] else limits.unsure_sigma))
+        sigmas.append(math.hypot(sigma[k], limits.least_sigma, 0.0 if f < 0 or confident[f] else limits.weak_sigma))
     line_direction = np.where(s.assigned >= 0, number[s.assigned], -1)
     if not rows:
         return _no_directions(len(lines.normal), "no direction has enough lines after refinement")
     pairs = len({f for f in frames if f >= 0})
-    unsure = len({f for f in frames if f >= 0 and not sure[f]})
-    which = f" ({unsure} unsure)" if unsure else ""
+    weak = len({f for f in frames if f >= 0 and not confident[f]})
+    which = f" ({weak} weak)" if weak else ""
     reason = f"{pairs} horizontal frame{'s' if pairs != 1 else ''}{which}, {int((line_direction >= 0).sum())} lines"
     return FoundDirections(np.array(rows), np.array(sigmas), np.array(frames, dtype=np.int64), line_direction, reason)
 

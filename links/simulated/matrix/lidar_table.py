@@ -30,7 +30,7 @@ from links.simulated.matrix.matrix import Conditions, cells, scenario_of
 from links.simulated.rig.closed_loop import ClosedLoop
 from links.simulated.rig.run import Simulation
 from links.simulated.world.scene import Truth
-from stages.geometry.lidar_models import LIDAR_MODELS
+from stages.geometry.lidar_models import LIDAR_MODELS, LidarModel
 from stages.messages import DroneFix
 
 NEAR_M = 1.0  # as `grd evaluate`

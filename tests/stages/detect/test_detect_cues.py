@@ -167,14 +167,14 @@ def test_a_cue_that_agreed_with_the_drone_has_one_accepted_that_hovers(monkeypat
     assert classified(stage, c, 1.0, monkeypatch).accepted
 
 
-def shown(c):
-    """The candidate, of which its cue has shown that it is."""
-    c.cues_shown = {"gnss"}
+def proven(c):
+    """The candidate, with a cue that is proven to be of it."""
+    c.proven_cues = {"gnss"}
     return c
 
 
 def test_what_limits_the_first_observations_does_not_limit_the_next(monkeypatch):
-    stage, c = EvidenceDetect(parked=True), shown(candidate(observation(0.0, np.array(PLACE_M))))
+    stage, c = EvidenceDetect(parked=True), proven(candidate(observation(0.0, np.array(PLACE_M))))
     stage.on_cue(gnss(0.2, PLACE_M))
     for passes in (1, 2):
         c.scan_passes = passes
@@ -184,7 +184,7 @@ def test_what_limits_the_first_observations_does_not_limit_the_next(monkeypatch)
 
 
 def test_a_gap_of_the_cue_is_no_contradiction(monkeypatch):
-    stage, c = EvidenceDetect(parked=True), shown(candidate(observation(0.0, np.array(PLACE_M))))
+    stage, c = EvidenceDetect(parked=True), proven(candidate(observation(0.0, np.array(PLACE_M))))
     c.scan_passes = 8
     stage.on_cue(gnss(0.2, PLACE_M))
     assert classified(stage, c, 1.0, monkeypatch).log_odds == pytest.approx(3.0)
@@ -206,7 +206,7 @@ def test_a_jump_of_frame_map_removes_the_cues_of_the_old_one():
 
 def test_a_cue_is_compared_only_with_what_the_lidar_alone_accepts(monkeypatch):
     stage = EvidenceDetect(parked=True, cues={"max_gnss": 6.0, "max_sum": 6.0})
-    c = shown(candidate(observation(0.0, np.array(PLACE_M))))
+    c = proven(candidate(observation(0.0, np.array(PLACE_M))))
     c.scan_passes = 8
     stage._now.table.put(c)
     stage.on_cue(gnss(0.2, PLACE_M))

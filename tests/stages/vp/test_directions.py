@@ -171,15 +171,15 @@ def test_two_horizontal_frames_are_separated_and_numbered_by_strength():
     assert list(one.frame) == [-1, 0, 0]
 
 
-def test_a_further_pair_that_stands_out_less_is_stated_as_unsure():
+def test_a_further_pair_that_stands_out_less_is_stated_as_weak():
     other = rotation_z(np.radians(30.0))
     rows = np.vstack([np.eye(3), np.eye(3)[:2], other[:, :2].T])
-    limits = dataclasses.replace(LIMITS, sure_elsewhere_score=100.0)
+    limits = dataclasses.replace(LIMITS, confident_elsewhere_score=100.0)
     found = find_structure(lines_along(rows, each=12), VerticalPrior(UP, np.radians(3), 0.0), limits)
     assert list(found.frame) == [-1, 0, 0, 1, 1]
     assert (np.degrees(found.sigma_rad[:3]) < 0.5).all()
     np.testing.assert_allclose(np.degrees(found.sigma_rad[3:]), 15.0, atol=0.1)
-    assert found.reason.startswith("2 horizontal frames (1 unsure)")
+    assert found.reason.startswith("2 horizontal frames (1 weak)")
 
 
 @pytest.mark.parametrize(("apart_deg", "frames"), [(3.0, {-1, 0}), (7.0, {-1, 0, 1})])

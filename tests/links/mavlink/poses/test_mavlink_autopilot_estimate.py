@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,8 +15,9 @@ from pymavlink.dialects.v20 import ardupilotmega
 from links.mavlink import Autopilot
 from links.mavlink.poses.autopilot_estimate import AutopilotAttitude, AutopilotEstimate, EstimateEvent
 from links.mavlink.poses.gate import PoseLimits, RejectReason
+from links.mavlink.poses.odom_frame import read_odom_frame
 from links.mavlink.poses.pose_sender import PoseSender
-from links.mavlink.transport.framing import packed
+from links.mavlink.transport.framing import packed, parse_frame
 from links.simulated.rig.pose_loop import PEER, VirtualConnection
 from tests.links.mavlink.mavlink_poses import HOST0, MS, good_pose, position_of
 
@@ -152,6 +155,31 @@ def test_with_a_wrong_compass_no_position_is_sent_once_the_yaw_is_measured(compa
     assert len(sender.messages(dataclasses.replace(pose, estimate=position_of(pose)), HOST0)) == 1
     assert len(sender.messages(pose, HOST0)) == sent
     assert sender.rejected == ({} if sent else {RejectReason.COMPASS: 1})
+
+
+def test_a_session_that_sends_yaw_reports_its_axes_and_keeps_the_yaw_of_the_attitude_for_a_restart(tmp_path: Path):
+    """The axes are those learnt, 25 deg; the autopilot's compass is 35 deg off them, and a restart reads its yaw."""
+    link = Autopilot(yaw="measured", switch_source=True, state_file=tmp_path / "sent.json")
+    session = link.open_session(VirtualConnection(), lambda: HOST0, threaded=False)
+    mav = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+    position = mavlink.MAVLink_local_position_ned_message(1000, 0, 0, 0, 0, 0, 0)
+    for message in (attitude(1000, 60.0), position):
+        list(session.receive(packed(message, mav), PEER, HOST0))
+    session.send_pose(good_pose(odom_yaw_rad=math.radians(25.0)))
+    assert session.counters["yaw in map of the sent axes [deg]"] == 25
+    session.tick()
+    kept = parse_frame(bytes.fromhex(json.loads((tmp_path / "sent.json").read_text())["odom"]))
+    assert math.degrees(read_odom_frame(kept, HOST0).yaw_map_odom_rad) == pytest.approx(60.0, abs=1e-3)
+
+
+def test_a_yaw_reset_before_the_switch_is_the_angle_between_the_axes_of_both_sets():
+    link = Autopilot(yaw="measured", switch_source=True)
+    session = link.open_session(VirtualConnection(), lambda: HOST0, threaded=False)
+    mav = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+    for boot_ms, yaw_deg, turn_deg in ((1000, 60.0, 0.0), (1100, 100.0, -40.0)):
+        list(session.receive(packed(attitude(boot_ms, yaw_deg), mav), PEER, HOST0))
+        session.send_pose(good_pose(HOST0 + (boot_ms - 1100) // 10 * MS, odom_yaw_rad=None))
+        assert math.degrees(session.switch._turn_rad) == pytest.approx(turn_deg, abs=1e-4)
 
 
 def test_landing_target_alone_is_no_sending_of_poses():

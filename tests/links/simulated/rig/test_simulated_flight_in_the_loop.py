@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import threading
 from pathlib import Path
 from typing import Any
@@ -190,6 +191,16 @@ def test_after_a_kill_with_a_state_file_poses_are_sent_again_within_5_s(
     after_s = [(r.arrival_ns - start_ns) * 1e-9 for r, _ in sent if r.arrival_ns == r.stamp_ns]
     assert max(s for s in after_s if s < killed_s[1]) == pytest.approx(killed_s[0], abs=0.1)
     assert min(s for s in after_s if s > killed_s[1]) - killed_s[0] < 5.0
+    outcome = json.loads(records[-1].data)
+    assert outcome["sent_poses"] > 100
+    assert (outcome["wrong_poses"], outcome["sent_worst_m"] < 0.5) == (0, True)
+    if outcome["sent_yaw_worst_deg"] is not None:
+        assert outcome["sent_yaw_worst_deg"] < 10.0
+        first_ns = sent[0][0].arrival_ns
+        attitude = next(m for r, m in messages(records, "/autopilot/rx", "ATTITUDE") if r.arrival_ns >= first_ns)
+        w, x, y, z = sent[0][1].q
+        yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        assert abs(math.remainder(yaw - attitude.yaw, math.tau)) < math.radians(15.0)  # the axes are the autopilot's
 
 
 def test_the_command_writes_the_flight_and_says_what_became_of_it(tmp_path: Path) -> None:

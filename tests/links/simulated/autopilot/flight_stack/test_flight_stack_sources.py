@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from links.simulated.autopilot.rules import PoseResult
-from tests.links.simulated.autopilot.flight_stack.sent_truth import Host
+from tests.links.simulated.autopilot.flight_stack.sent_truth import TO_EXTERNAL, Host
 
 
 def test_on_gps_it_holds_within_the_error_of_the_gps() -> None:
@@ -28,6 +28,16 @@ def test_after_the_switch_it_hovers_on_what_it_is_sent(kind: str, sets: str) -> 
     assert "EKF failsafe" not in host.events()
     estimate = host.stack.ekf.output()
     np.testing.assert_allclose(estimate[0:2], host.stack.quadrotor.state[0:2], atol=0.2)  # map is the world here
+
+
+@pytest.mark.parametrize("stated", [True, False])
+def test_a_plan_on_external_poses_is_flown_in_the_axes_that_grd_states(stated: bool) -> None:
+    """`Host` sends in the axes of map; without a statement they are taken as axes that point north, 57 deg off."""
+    host = Host(16.0, plan=[*TO_EXTERNAL[:2], {"do": "go_to", "xyz_m": [11.0, 0.0, 10.0], "for_s": 12}])
+    host.stack.axes_yaw_rad = 0.0 if stated else None
+    host.run(16.0)
+    away_m = float(np.linalg.norm(host.stack.quadrotor.state[0:3] - [11.0, 0.0, 10.0]))
+    assert (away_m < 0.7) == stated
 
 
 @pytest.mark.parametrize(("sets", "flies"), [(["gps", "external_position"], True), (["external_no_velocity"], False)])

@@ -79,6 +79,11 @@ class ObservationTap(Tap):
         if observation is not None:
             observation.add(record)
 
+    @property
+    def all_began(self) -> bool:
+        """Whether every source has sent at least one record."""
+        return all(self._by_topic[topic].records.count for topic in self._topics.values())
+
     def observation(self, name: str) -> Observation:
         """The records of the source of that name."""
         return self._by_topic[self._topics[name]]

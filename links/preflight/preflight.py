@@ -20,6 +20,7 @@ from links.preflight.observations import Observations
 from links.recording import Progress, Session
 from stages.messages import DroneAttitude, DroneOdometry
 
+POLL_S = 0.05  # while sources begin
 OUT_DIR = Path("out")  # default folder for the output of `grd run`
 
 Wait = Callable[[float], None]
@@ -37,12 +38,12 @@ def preflight_live(
 ) -> Iterator[CheckResult]:
     """Check live hardware; yields each result as soon as it is known. Raises LinkError if the simulated rig fails.
 
-    First the sources alone run for `seconds`. Then the devices are asked (autopilot parameters, free disk space at
+    First the sources alone run: for `seconds` from when all have sent a record, or twice as long in all. Then the devices are asked (autopilot parameters, free disk space at
     `out_dir`). Then the drone is moved by hand while the LiDAR tracks it, unless `ask` is None.
     `whole`: the graph of all hosts, if `graph` is the part of one; what the configuration lacks is judged by it.
     """
     with simulated_rig(graph):
-        observations = collect_live(sources_only(graph), lambda _: wait(seconds))
+        observations = collect_live(sources_only(graph), lambda tap: _observe(tap, wait, seconds))
         yield from link_checks(graph, observations, out_dir, whole)
         if not _has_attitude(observations):
             return
@@ -56,6 +57,15 @@ def preflight_live(
         observations = collect_live(tracking(graph), lambda tap: moved.extend(_hand_motions(tap, wait, ask, step_s)))
         yield from moved
         yield from motion_checks(observations)
+
+
+def _observe(tap: ObservationTap, wait: Wait, seconds: float) -> None:
+    """Wait until every source has begun, for at most `seconds`, then for `seconds`: a process takes time to start."""
+    waited_s = 0.0
+    while not tap.all_began and waited_s < seconds:
+        wait(POLL_S)
+        waited_s += POLL_S
+    wait(seconds)
 
 
 def preflight_recording(

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-import socket
-import threading
-import time
+import subprocess
+import sys
 
 import cv2
 import numpy as np
@@ -38,30 +37,37 @@ def packet(first_pulse_ns: int, mode: str = "strongest") -> bytes:
     return encoder.encode(first_pulse_ns, azimuths, np.full(shape, 10.0), np.full(shape, 50, np.uint8))
 
 
+SENDER = """\
+import socket, sys, time
+port, packet_ns, at = (int(word) for word in sys.argv[1:])
+packet, sent, began_ns = bytearray(sys.stdin.buffer.read()), 0, time.monotonic_ns()
+with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
+    while True:
+        time.sleep(0.002)
+        while (sent + 1) * packet_ns < time.monotonic_ns() - began_ns:
+            packet[at : at + 4] = (sent * packet_ns // 1000).to_bytes(4, "little")
+            udp.sendto(packet, ("127.0.0.1", port))
+            sent += 1
+"""
+
+
 class SendingLidar:
-    """Sends packets at the sensor's pace, in a thread, until its context ends."""
+    """Sends packets at the sensor's pace until its context ends, in a process: ours may be busy, a sensor is not."""
 
     def __init__(self, port: int) -> None:
-        self._port, self._closed = port, threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True)
+        numbers = (port, FORM.packet_ns("strongest"), TIMESTAMP_AT)
+        self._command = [sys.executable, "-S", "-E", "-c", SENDER, *map(str, numbers)]
 
     def __enter__(self) -> SendingLidar:
-        self._thread.start()
+        self._process = subprocess.Popen(self._command, stdin=subprocess.PIPE)
+        assert self._process.stdin is not None
+        self._process.stdin.write(packet(0))
+        self._process.stdin.close()
         return self
 
     def __exit__(self, *exception: object) -> None:
-        self._closed.set()
-        self._thread.join()
-
-    def _run(self) -> None:
-        template, sent, began_ns = bytearray(packet(0)), 0, time.monotonic_ns()
-        packet_ns, at = FORM.packet_ns("strongest"), TIMESTAMP_AT
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
-            while not self._closed.wait(0.002):
-                while (sent + 1) * packet_ns < time.monotonic_ns() - began_ns:
-                    template[at : at + 4] = (sent * packet_ns // 1000).to_bytes(4, "little")
-                    udp.sendto(template, ("127.0.0.1", self._port))
-                    sent += 1
+        self._process.kill()
+        self._process.wait()
 
 
 def good_parameters(profile="ardupilot") -> dict[str, float]:

@@ -38,9 +38,10 @@ def preflight_live(
 ) -> Iterator[CheckResult]:
     """Check live hardware; yields each result as soon as it is known. Raises LinkError if the simulated rig fails.
 
-    First the sources alone run: for `seconds` from when all have sent a record, or twice as long in all. Then the devices are asked (autopilot parameters, free disk space at
-    `out_dir`). Then the drone is moved by hand while the LiDAR tracks it, unless `ask` is None.
-    `whole`: the graph of all hosts, if `graph` is the part of one; what the configuration lacks is judged by it.
+    First the sources alone run: for `seconds` from when all have sent a record, or twice as long in all. Then the
+    devices are asked (autopilot parameters, free disk space at `out_dir`). Then the drone is moved by hand while the
+    LiDAR tracks it, unless `ask` is None. `whole`: the graph of all hosts, if `graph` is the part of one; what the
+    configuration lacks is judged by it.
     """
     with simulated_rig(graph):
         observations = collect_live(sources_only(graph), lambda tap: _observe(tap, wait, seconds))

@@ -32,7 +32,10 @@ KNOTS = 6
 LEAST_KNOWN = 50  # rows that have a feature, to use it
 LLR_KNOTS = (-12.0, -6.0, -3.0, 0.0, 3.0, 6.0, 12.0)  # [nats] of features that are log likelihood ratios
 # assumed: the part of each log likelihood ratio that counts before the data show it
-LLR_SHARE = {"displaced_nats": 0.8, "over_bird_nats": 0.9, "over_balloon_nats": 0.9, "return_count_nats": 0.5}
+LLR_SHARE = {
+    "displaced_nats": 0.8, "over_bird_nats": 0.9, "over_balloon_nats": 0.9, "return_count_nats": 0.5,
+    "imu_over_static_nats": 0.5, "imu_over_bird_nats": 0.5, "imu_over_balloon_nats": 0.5,
+}  # fmt: skip
 PRIOR_PENALTY = 0.02  # assumed; of the priors, relative to the other parameters
 STRENGTHS = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0)  # of the penalty
 FOLDS = 3
@@ -46,14 +49,14 @@ USED: tuple[tuple[str, ...], ...] = (  # features of each alternative
         "range_m", "scan_passes", "return_count_nats", "free_sectors", "least_free", "neighbour_score",
         "isolated_score", "large_object_m", "large_object_share", "extent_ratio", "largest_extent_ratio",
         "too_long_passes", "scatter_m", "displacement_m", "straight_mps", "straight_sigmas", "moves", "near_rejected",
-        "revisited", "displaced_nats", "misfit", "passes_since_reacquired",
+        "revisited", "displaced_nats", "misfit", "passes_since_reacquired", "imu_over_static_nats", "imu_misfit",
     ),
     (
         "range_m", "age_s", "return_ratio", "extent_ratio", "top_mps", "relative_speed_mps", "acceleration_mps2",
         "fastest_mps", "hardest_mps2", "calm_s", "steady_s", "scatter_m", "straight_sigmas", "climb_mps",
-        "over_bird_nats", "misfit",
+        "over_bird_nats", "misfit", "imu_over_bird_nats", "imu_misfit",
     ),
-    ("range_m", "round_chords", "rough_chords", "straight_mps", "over_balloon_nats"),
+    ("range_m", "round_chords", "rough_chords", "straight_mps", "over_balloon_nats", "imu_over_balloon_nats"),
 )  # fmt: skip
 RANGED = {  # features whose weight depends on the range: their terms are near and far
     "scan_passes", "first_returns", "return_ratio", "free_sectors", "neighbour_score", "isolated_score",
@@ -179,7 +182,7 @@ def _of_term(term: Term) -> list[_Column]:
 
 def _missing(alternative: int, name: str, at: At, mean: float) -> list[_Column]:
     """The parameter of a missing feature; a log likelihood ratio that is missing is no evidence."""
-    if name.endswith("_nats") or name == "misfit":
+    if name.endswith(("_nats", "misfit")):
         return []
     return [_Column(alternative, name, at, np.nan, np.nan, 0, mean)]
 

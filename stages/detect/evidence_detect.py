@@ -3,7 +3,7 @@
     pulses -> chords (chords.py): short, free at both ends, above the horizon
            -> observations (observations.py): one scan pass on one object, and its surroundings (isolation.py)
            -> candidates (candidate.py): observations that fit one moving object (flight.py)
-           -> log-odds of a drone over a false return, a static object, a bird and a balloon (classifier.py)
+           -> log-odds of a drone over a false return, a static object, a bird and a balloon (trained/model.py)
 
 A scan pass is one passing of the rotor; they are 0.1 s apart. A candidate is accepted at `accept_probability`. A
 candidate above `follow_up_probability` is promising and published at once (Candidates), so that the aim can observe it
@@ -36,8 +36,8 @@ from stages.detect.observations import ObservationFinder, ObservationLimits, Sli
 from stages.detect.reacquire import reacquired_candidate, without_duplicates
 from stages.detect.telemetry import DetectorTelemetry
 from stages.detect.trained.existence import FalseReturns, birth_nats, passed_nats, range_share
-from stages.detect.trained.features import features_of
-from stages.detect.trained.model import DetectorModel
+from stages.detect.trained.features import FREE_SPACE, features_of
+from stages.detect.trained.model import DetectorModel, reasons_of
 from stages.geometry.frames import Array64
 from stages.geometry.rig_lidar import RigLidar
 from stages.geometry.trajectory import VehicleTrajectory
@@ -51,6 +51,7 @@ from stages.messages import (
     Detections,
     DroneCue,
     DroneLocalPosition,
+    DroneMotion,
     DroneOdometry,
     SweptPulses,
     VehicleMotion,
@@ -125,24 +126,21 @@ class EvidenceDetectSettings(Settings):
     free_space: bool = True  # ablation: False ignores the measured surroundings
     weights: ClassifierWeights = ClassifierWeights()  # log likelihood ratios of the classifier
     cues: CueWeights = CueWeights()  # what GNSS, ranging and barometer may add
-    model: DetectorModel | None = None  # trained by `grd train-detector`; null: the classifier by `weights`
+    model: DetectorModel | None = None  # by `grd train-detector`, configs/models; null: the classifier by `weights`
 
     @model_validator(mode="after")
     def _settings_agree(self) -> EvidenceDetectSettings:
         if self.furthest_m <= self.nearest_m:
             raise ValueError("furthest_m must be larger than nearest_m")
-        if self.model is not None and self.model.lidar_model != self.unit.model:
-            raise ValueError(
-                f"the trained model is for the {self.model.lidar_model}, not for the {self.unit.model}: train one on "
-                "runs with it (`grd train-detector`), or set `model: null` for the classifier by `weights`"
-            )
         return self
 
 
 class EvidenceDetect(Stage[EvidenceDetectSettings]):
     """Accepts small objects that are repeatedly observed with free space around them; rejects others with a reason."""
 
-    optional_inputs: ClassVar[frozenset[str]] = frozenset({"motion", "drone_position", "drone_odometry", "cue"})
+    optional_inputs: ClassVar[frozenset[str]] = frozenset(
+        {"motion", "drone_position", "drone_odometry", "drone_motion", "cue"}
+    )
 
     def __init__(self, settings: EvidenceDetectSettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
@@ -169,6 +167,10 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
     def on_drone_odometry(self, odometry: DroneOdometry) -> None:
         """Add the drone's odometry, from an autopilot that sends it."""
         self._now.telemetry.add_odometry(odometry)
+
+    def on_drone_motion(self, motion: DroneMotion) -> None:
+        """Add an interval of the drone's IMU, a feature of the trained model."""
+        self._now.telemetry.add_motion(motion)
 
     def on_cue(self, cue: DroneCue) -> CueState:
         """Add a measurement of another sensor, and compare it with the drones that the LiDAR alone would accept."""
@@ -284,30 +286,40 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
         settings = self.settings
         motion_known = self._motion_known(c.seen_ns)
         c.add_log_ratios(now.telemetry.of(c, motion_known))
-        c.log_odds, c.reason = classify(c, settings.weights, settings.free_space, motion_known)
+        c.imu_log_ratios = now.telemetry.by_imu(c, motion_known)
         c.features = features_of(c, settings.span_m, motion_known)
+        if not settings.free_space:
+            c.features[list(FREE_SPACE)] = math.nan
+        prediction = None
         if settings.model is not None:
-            c.log_odds, c.reason = settings.model.classify(c)
+            prediction = settings.model.classify(c)
+            c.log_odds, c.reason = prediction.log_odds, ""
+        else:
+            c.log_odds, c.reason = classify(c, settings.weights, settings.free_space, motion_known)
         c.own_log_odds = c.log_odds
-        self._add_cues(now, c)
+        remark = self._add_cues(now, c)
         now.classified[c.number] = c
         accept = log_odds_of(settings.accept_probability)
         c.accepted = c.log_odds >= accept or (c.accepted and c.own_log_odds >= accept - HYSTERESIS_NATS)
         before, c.is_promising = c.is_promising, c.log_odds >= log_odds_of(settings.follow_up_probability)
         c.was_promising |= c.is_promising
+        if prediction is not None and (c.is_promising or c.observations > 1):  # others are rejected at once
+            c.reason = reasons_of(c.features, prediction)
+        c.reason += remark
         return c.was_promising or before != c.is_promising
 
-    def _add_cues(self, now: _State, c: Candidate) -> None:
+    def _add_cues(self, now: _State, c: Candidate) -> str:
         """Add the evidence of cues to the log-odds: their lowest of the last seconds, so that a short match is none.
 
-        A cue is of one object: it adds nothing to others while it matches an accepted candidate. What the cues
-        add that are not proven to be of this candidate ends below the threshold of acceptance.
+        A cue is of one object: it adds nothing to others while it matches an accepted candidate. What the cues add
+        that are not proven to be of this candidate ends below the threshold of acceptance. Returns the remark for
+        people.
         """
         state = _object(c)
         nats, of_proven, remark = now.cues.nats(state, now.trail, c.stamp_ns, c.proven_cues)
         if not remark:
             c.cue_nats = None
-            return
+            return ""
         if nats > 0.0 and any(o is not c and o.accepted and (o.cue_nats or 0.0) > 0.0 for o in now.table):
             nats = 0.0
         if c.cue_nats is not None:
@@ -321,7 +333,7 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
         nats = min(nats, max(of_proven, ceiling) if c.scan_passes >= CUE_PASSES else ceiling)
         observed = min(c.log_odds, log_odds_of(self.settings.follow_up_probability))
         c.log_odds = max(c.log_odds + nats, observed)  # a wrong cue does not end the observation of the drone
-        c.reason += f"; cues {nats:+.1f} ({remark})"
+        return f"; cues {nats:+.1f} ({remark})"
 
     def _count_pass_throughs(self, now: _State, part: Slice, now_ns: int) -> None:
         """Count the pulses that pass through a candidate's predicted position, scan pass by scan pass."""

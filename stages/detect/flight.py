@@ -75,6 +75,11 @@ def scatter_m(range_m: float) -> float:
     return 0.05 + 0.0015 * range_m
 
 
+def path_sigma_m(range_m: float) -> float:
+    """The same of a path that is compared with another sensor's, with the errors of the vehicle's pose."""
+    return 0.03 + scatter_m(range_m)
+
+
 def fit_motion(path_ns: list[int], paths_m: Sequence[list[Array64]], range_m: float) -> list[Motion] | None:
     """Parabola x + v t + a t^2 / 2 through the observations of the last 1.2 s, for each path; None: too few.
 

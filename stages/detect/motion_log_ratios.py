@@ -12,6 +12,9 @@ Each model is a Gaussian over the path's n points, with c and psi integrated out
 marginal likelihoods. Speeds and heights alone separate the drone from a bird in a few scan passes, whatever psi is. The
 odometry of a hovering drone gives no evidence against a lamp.
 
+The IMU alone gives d_i up to an unknown velocity, over seconds: u is as wide as a drone's speed, and only the
+acceleration of the path is compared. It is evidence when the autopilot's estimate may contain our own pose.
+
 Source: ours; DESIGN, The graph: `odometry` ("autopilot odometry when present").
 """
 
@@ -23,11 +26,12 @@ from typing import NamedTuple
 import numpy as np
 
 from stages.geometry.frames import Array64
-from stages.kernels.detect.motion_log_ratios import weigh
+from stages.kernels.detect.motion_log_ratios import BY_IMU, BY_ODOMETRY, weigh
 from stages.odometry.drone.telemetry import KEPT_NS, DroneTelemetry
 
 MAX_POINTS = 14
 SILENT_NS = 2_000_000_000  # without telemetry for longer, a path may have switched to another object
+IMU_NS = 4_000_000_000  # longest path compared with the IMU: its accelerometer's error is constant for so long
 DENIED = -3.0  # [nats] below it the path contradicts the odometry
 MAX_MISFIT = 4.0  # beyond it no model fits, and nothing favours the drone; drones reach 1.3
 
@@ -49,18 +53,24 @@ class MotionLogRatios(NamedTuple):
 
 
 def compare_motion(
-    telemetry: DroneTelemetry, path_ns: list[int], path_m: list[Array64], sigma_m: float, level_known: bool
+    telemetry: DroneTelemetry,
+    path_ns: list[int],
+    path_m: list[Array64],
+    sigma_m: float,
+    level_known: bool,
+    by_imu: bool = False,
 ) -> MotionLogRatios | None:
     """Compare a path (n, 3) in a static level frame with the drone's odometry; None: no telemetry to compare.
 
     Observations without telemetry are left out. Without recent telemetry there is no comparison.
 
     `level_known` False: the vehicle's motion is unknown, so only heights are compared. sigma_m: of an observation.
+    by_imu: the odometry integrates the IMU, and its velocity is unknown.
     """
     span_ns = telemetry.span_ns
     if span_ns is None or len(path_ns) < 2 or path_ns[-1] > span_ns[1] + SILENT_NS:
         return None
-    first = bisect_left(path_ns, max(path_ns[-1] - KEPT_NS // 2, span_ns[0]))
+    first = bisect_left(path_ns, max(path_ns[-1] - (IMU_NS if by_imu else KEPT_NS // 2), span_ns[0]))
     if len(path_ns) - first < 2:
         return None
     rows = list(range(first, len(path_ns)))
@@ -73,10 +83,15 @@ def compare_motion(
         return None
     rows, odometry_m = list(positions), np.array(list(positions.values()))
     t = (np.array([path_ns[k] for k in rows]) - path_ns[rows[-1]]) * 1e-9
+    if by_imu:
+        odometry_m -= np.outer(
+            (t - t[0]) / (t[-1] - t[0]), odometry_m[-1] - odometry_m[0]
+        )  # its mean velocity is unknown
     compared_m = odometry_m if level_known else odometry_m[:, 2:]
     displacement_m = float(np.sqrt(((compared_m - compared_m[0]) ** 2).sum(axis=1).max()))
     x_m = np.array([path_m[k] for k in rows])
-    log_ratios = MotionLogRatios(*weigh(t, x_m, odometry_m, sigma_m, level_known), displacement_m)
+    error = BY_IMU if by_imu else BY_ODOMETRY
+    log_ratios = MotionLogRatios(*weigh(t, x_m, odometry_m, sigma_m, level_known, error), displacement_m)
     if log_ratios.misfit <= MAX_MISFIT:
         return log_ratios
     static, bird, balloon, wire = (min(ratio, 0.0) for ratio in log_ratios[:4])

@@ -20,7 +20,7 @@ from dataclasses import replace
 import numpy as np
 
 from stages.detect.candidate import Candidate, Observation
-from stages.detect.flight import scatter_m
+from stages.detect.flight import path_sigma_m
 from stages.geometry.frames import Array64
 from stages.kernels.detect.candidate import SIGMA_M
 from stages.kernels.detect.motion_log_ratios import DRIFT_MPS, DRIFT_UP_MPS
@@ -57,7 +57,7 @@ def reacquire(
         if odometry_level_m < LEAST_M:
             continue
         pause_s = (s.stamp_ns - c.seen_ns) * 1e-9
-        scatter = math.sqrt(2.0) * (0.03 + scatter_m(s.range_m))
+        scatter = math.sqrt(2.0) * path_sigma_m(s.range_m)
         level = (level_m - odometry_level_m) / math.hypot(scatter, DRIFT_MPS * pause_s)
         up = (moved_m[2] - odometry_m[2]) / math.hypot(scatter, DRIFT_UP_MPS * pause_s)
         cost = level * level + up * up

@@ -1,4 +1,4 @@
-"""The drone's telemetry as the detector uses it: local position and odometry of the autopilot.
+"""The drone's telemetry as the detector uses it: local position and odometry of the autopilot, and its IMU.
 
 Source: ours; DESIGN, The graph: `odometry` ("autopilot odometry when present").
 """
@@ -12,15 +12,17 @@ from collections.abc import Iterable
 import numpy as np
 
 from stages.detect.candidate import START_SPEED_MPS, Candidate, Observation
-from stages.detect.flight import scatter_m
+from stages.detect.flight import path_sigma_m
 from stages.detect.motion_log_ratios import MotionLogRatios, compare_motion
 from stages.detect.reacquire import reacquire
 from stages.geometry.frames import Array64
 from stages.geometry.trajectory import VehicleTrajectory
-from stages.messages import DroneLocalPosition, DroneOdometry
+from stages.messages import DroneLocalPosition, DroneMotion, DroneOdometry
+from stages.odometry.drone.inertial_path import InertialPath
 from stages.odometry.drone.telemetry import DroneTelemetry
 
 MOVES_MPS = 1.0  # faster, it flies
+IMU_PASSES = 3  # scan passes that show no acceleration yet
 MIN_PASSES_SINCE = 3  # scan passes after which the path since a reacquisition is compared alone
 
 
@@ -30,6 +32,7 @@ class DetectorTelemetry:
     def __init__(self) -> None:
         self._position, self._odometry = DroneTelemetry(), DroneTelemetry()
         self._both = (self._position, self._odometry)
+        self._imu = InertialPath()
 
     def add_position(self, position: DroneLocalPosition) -> None:
         """Add a local position."""
@@ -38,6 +41,16 @@ class DetectorTelemetry:
     def add_odometry(self, odometry: DroneOdometry) -> None:
         """Add an odometry message."""
         self._odometry.add_odometry(odometry)
+
+    def add_motion(self, motion: DroneMotion) -> None:
+        """Add an interval of the IMU."""
+        self._imu.add(motion)
+
+    def by_imu(self, c: Candidate, motion_known: bool) -> MotionLogRatios | None:
+        """Log ratios of a candidate's path by the accelerations that the IMU measured; None: no IMU, or no path yet."""
+        if c.scan_passes <= IMU_PASSES:
+            return None
+        return compare_motion(self._imu.path, c.path_ns, c.path_m, path_sigma_m(c.range_m), motion_known, by_imu=True)
 
     def of(self, c: Candidate, motion_known: bool) -> MotionLogRatios | None:
         """Log ratios of a candidate's path against telemetry; None: no telemetry.
@@ -55,9 +68,7 @@ class DetectorTelemetry:
         """The same from observation number `first` on."""
         path_ns, path_m, log_ratios = c.path_ns[first:], c.path_m[first:], None
         for telemetry in self._both:
-            log_ratios = log_ratios or compare_motion(
-                telemetry, path_ns, path_m, 0.03 + scatter_m(c.range_m), motion_known
-            )
+            log_ratios = log_ratios or compare_motion(telemetry, path_ns, path_m, path_sigma_m(c.range_m), motion_known)
         return log_ratios
 
     def reacquire(self, candidates: Iterable[Candidate], s: Observation) -> tuple[Candidate, Array64] | None:

@@ -68,7 +68,6 @@ VARIANTS: dict[str, dict[str, Any] | None] = {
 CONFIG = Path("configs/cues.yaml")
 SETS = (
     "stages.fuse=null",
-    "stages.drone_motion=null",
     "links.viewer=null",
     f"stages.cues.config.altitude.home_up_m={-CAMERA_HEIGHT_M}",
 )

@@ -36,7 +36,7 @@ from stages.messages import DroneFix
 NEAR_M = 1.0  # as `grd evaluate`
 AFTER_S = 5.0
 CONFIG = Path("configs/estimate.yaml")
-SETS = ("stages.fuse=null", "stages.drone_motion=null", "links.viewer=null")
+SETS = ("stages.fuse=null", "links.viewer=null")
 
 
 class FixTap(Tap):

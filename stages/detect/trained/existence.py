@@ -24,7 +24,8 @@ import numpy as np
 SHELL_M = 4.0  # of the range histogram of false returns
 SHELLS = 32
 MEMORY_S = 6.0  # false returns count for this long (1 / e)
-PASS_S = 0.1  # between scan passes: 600 rpm; see `DetectorModel.lidar_model`
+PASS_S = 0.1  # between scan passes: 600 rpm
+CERTAIN_NATS = 30.0  # limit of arithmetic
 LIFETIME_S = 30.0  # assumed mean time that an object stays in view
 BIRTHS_PER_S = 0.02  # assumed: one object appears in the sky in 50 s
 LEAST_FALSE_PER_S = 0.05  # false returns of a clear sky, per shell: the prior of the histogram
@@ -65,7 +66,7 @@ def birth_nats(false_per_s: float) -> float:
 
 def survived_nats(nats: float, dt_s: float) -> float:
     """Log-odds after dt_s without information."""
-    exists = 1.0 / (1.0 + math.exp(-max(min(nats, 30.0), -30.0))) * math.exp(-dt_s / LIFETIME_S)
+    exists = 1.0 / (1.0 + math.exp(-max(min(nats, CERTAIN_NATS), -CERTAIN_NATS))) * math.exp(-dt_s / LIFETIME_S)
     return math.log(exists / (1.0 - exists))
 
 

@@ -21,8 +21,8 @@ from stages.detect.flight import Motion, straight_flight
 from stages.detect.motion_log_ratios import MotionLogRatios
 from stages.geometry.frames import Array64
 
-VERSION = 3
-PULSE_RAD = math.radians(0.2)  # between two pulses of a laser: VLP-16, 600 rpm; see `DetectorModel.lidar_model`
+VERSION = 4
+PULSE_RAD = math.radians(0.2)  # between two pulses of a laser: VLP-16, 600 rpm
 NONE_M = 4.0  # written where no large object is near
 NOT_DISPLACED_NATS = 3.0  # cap of the log ratio over a static object that may seem to move as far
 
@@ -79,12 +79,20 @@ FEATURES: tuple[Feature, ...] = (
     Feature("over_balloon_nats", 1, "moves as the drone's odometry, not as a balloon", "telemetry"),
     Feature("misfit", -1, "residual from the drone's odometry", "telemetry"),
     Feature("displaced_nats", 1, "moves as the drone's odometry, farther than a static one seems to", "telemetry"),
+    Feature("imu_over_static_nats", 1, "accelerates as the drone's IMU, not as a static object", "imu"),
+    Feature("imu_over_bird_nats", 1, "accelerates as the drone's IMU, not as a bird", "imu"),
+    Feature("imu_over_balloon_nats", 1, "accelerates as the drone's IMU, not as a balloon", "imu"),
+    Feature("imu_misfit", -1, "residual from the drone's IMU", "imu"),
 )
 GROUPS = tuple(dict.fromkeys(feature.group for feature in FEATURES))
 NAMES = tuple(feature.name for feature in FEATURES)
 RANGE = NAMES.index("range_m")
 TELEMETRY = NAMES.index("over_static_nats")  # NaN: not compared with telemetry
+FREE_SPACE = tuple(
+    NAMES.index(name) for name in ("free_sectors", "least_free", "neighbour_score", "isolated_score")
+)  # measured around a candidate
 NO_TELEMETRY = (math.nan,) * 5
+NO_IMU = NO_TELEMETRY[1:]
 
 
 def features_of(c: Candidate, span_m: float, motion_known: bool) -> Array64:
@@ -96,7 +104,7 @@ def features_of(c: Candidate, span_m: float, motion_known: bool) -> Array64:
     passes = float(c.scan_passes)
     m, slower = c.motion or NOT_MEASURED, c.slower_motion or NOT_MEASURED
     speed, sigmas, climb = straight_flight(c.path_ns, c.path_m, c.range_m)
-    ratios = c.log_ratios
+    ratios, imu = c.log_ratios, c.imu_log_ratios
     since = math.nan if not c.reacquired_at else passes - c.reacquired_at
     telemetry = NO_TELEMETRY if ratios is None else (*ratios[:3], ratios.misfit, displaced_nats(c, ratios))
     return np.array(
@@ -139,6 +147,7 @@ def features_of(c: Candidate, span_m: float, motion_known: bool) -> Array64:
             c.revisited,
             since,
             *telemetry,
+            *(NO_IMU if imu is None else (*imu[:3], imu.misfit)),
         ],
         dtype=np.float64,
     )

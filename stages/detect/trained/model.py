@@ -78,7 +78,7 @@ class DetectorModel(StrictModel):
     """The weights file."""
 
     feature_version: int
-    lidar_model: LidarModel = "VLP-16"  # of the runs: return_ratio, existence_nats and scan passes depend on it
+    lidar_model: LidarModel = "VLP-16"  # of the runs
     priors: tuple[tuple[float, float], ...]  # of each alternative, without and with telemetry [nats]
     terms: tuple[Term, ...] = Field(min_length=1)
     trained: dict[str, Any] = {}  # command, data, versions, held-out scores: for people
@@ -114,15 +114,12 @@ class DetectorModel(StrictModel):
         log_odds = evaluate(*self._tables, features, farness(features[RANGE]), over, contributions)
         return Prediction(log_odds, int(np.argmin(over)), contributions[0])
 
-    def classify(self, c: Candidate) -> tuple[float, str]:
-        """Log-odds that the candidate is a drone by its `features`, and the reasons; see `classifier.classify`.
-
-        Sets `c.alternative` and `c.rejection`.
-        """
+    def classify(self, c: Candidate) -> Prediction:
+        """Whether the candidate is a drone by its `features`. Sets `c.alternative` and `c.rejection`."""
         prediction = self.predict(c.features)
         c.alternative = ALTERNATIVES[prediction.alternative]
         c.rejection = c.alternative.value
-        return prediction.log_odds, reasons_of(c.features, prediction)
+        return prediction
 
 
 def reasons_of(features: Array64, prediction: Prediction) -> str:

@@ -16,6 +16,8 @@ from stages.kernels.geometry.smooth_motion import log_p, misfit, model_of
 YAWS = 72  # steps of 5 deg: coarser, a fast straight flight fits none
 DRIFT_MPS = 0.3  # horizontal velocity drift of autopilot and vehicle together
 DRIFT_UP_MPS = 0.1
+BY_ODOMETRY = (DRIFT_MPS, DRIFT_UP_MPS, 0.0, 0.0)  # sigmas of its error: velocity, level and up; acceleration, the same
+BY_IMU = (6.0, 2.0, 0.35, 0.2)  # its velocity is not known; roll and pitch of the autopilot are 2 deg wrong
 SCATTERED_M = 0.45  # scatter of the sightings of a long object
 SLIDING_MPS = 0.5  # or speed at which sightings move along it
 FOLLOWED_MPS = 5.0  # the same along a wire, where each pass is aimed as at a flying object
@@ -28,21 +30,31 @@ LOOSE, LOOSE_MPS, LOOSE_MPS2 = 0.1, 2.0, 0.3  # assumed share of balloons that d
 
 @compiled
 def weigh(
-    t_s: Array64, x_m: Array64, odometry_m: Array64, sigma_m: float, level_known: bool
+    t_s: Array64,
+    x_m: Array64,
+    odometry_m: Array64,
+    sigma_m: float,
+    level_known: bool,
+    error: tuple[float, float, float, float] = BY_ODOMETRY,
 ) -> tuple[float, float, float, float, float]:
-    """Values of MotionLogRatios for a path x (n, 3) at times t (n,), compared with the drone's odometry (n, 3)."""
+    """Values of MotionLogRatios for a path x (n, 3) at times t (n,), compared with the drone's odometry (n, 3).
+
+    error: of the odometry, BY_ODOMETRY or BY_IMU.
+    """
     x, d = x_m.copy(), odometry_m.copy()
     for axis in range(3):
         x[:, axis] -= x[:, axis].mean()
         d[:, axis] -= d[:, axis].mean()
-    as_drone = model_of(t_s, sigma_m, DRIFT_MPS, 0.0)
+    drone, off2 = _as_drone(t_s, x, d, sigma_m, level_known, error)
+    if error != BY_ODOMETRY:  # it may also hover
+        drone = _log_sum(drone, _as_drone(t_s, x, d, sigma_m, level_known, BY_ODOMETRY)[0]) - math.log(2.0)
+    as_still = model_of(t_s, sigma_m, DRIFT_MPS, 0.0)
     as_long = model_of(t_s, SCATTERED_M, 0.0, 0.0)
     as_sliding, as_followed = model_of(t_s, sigma_m, SLIDING_MPS, 0.0), model_of(t_s, sigma_m, FOLLOWED_MPS, 0.0)
     up = x[:, 2].copy()
-    upright = model_of(t_s, sigma_m, DRIFT_UP_MPS, 0.0)
-    drone = log_p(upright, t_s, up - d[:, 2])
-    off2, coordinates = misfit(upright, t_s, up - d[:, 2]), 1.0
-    still, long = log_p(upright, t_s, up), log_p(as_long, t_s, up)  # a static object has the same drift
+    coordinates = 3.0 if level_known else 1.0
+    # a static object has the same drift
+    still, long = log_p(model_of(t_s, sigma_m, DRIFT_UP_MPS, 0.0), t_s, up), log_p(as_long, t_s, up)
     sliding = followed = still
     bird = log_p(model_of(t_s, sigma_m, BIRD[2], BIRD[3]), t_s, up)
     sway_mps = SWAY_M / max(t_s.max() - t_s.min(), 1e-3)
@@ -53,19 +65,14 @@ def weigh(
         as_wheeling = model_of(t_s, sigma_m, BIRD[0], BIRD[1])
         as_balloon = model_of(t_s, sigma_m, min(BALLOON[0], sway_mps), BALLOON[1])
         as_loose = model_of(t_s, sigma_m, LOOSE_MPS, LOOSE_MPS2)
-        turned, cruising, wheeling, level2 = np.empty(YAWS), np.empty(YAWS), 0.0, math.inf
+        cruising, wheeling = np.empty(YAWS), 0.0
         for k in range(YAWS):
             c, s = math.cos(math.tau * k / YAWS), math.sin(math.tau * k / YAWS)
-            ex, ey = x[:, 0] - c * d[:, 0] + s * d[:, 1], x[:, 1] - s * d[:, 0] - c * d[:, 1]
-            turned[k] = log_p(as_drone, t_s, ex) + log_p(as_drone, t_s, ey)
-            level2 = min(level2, misfit(as_drone, t_s, ex) + misfit(as_drone, t_s, ey))
             cruising[k] = log_p(as_cruising, t_s, x[:, 0] - CRUISE_MPS * c * t_s)
             cruising[k] += log_p(as_cruising, t_s, x[:, 1] - CRUISE_MPS * s * t_s)
-        drone += _log_mean(turned)
-        off2, coordinates = off2 + level2, 3.0
         for axis in range(2):
             e = x[:, axis].copy()
-            still += log_p(as_drone, t_s, e)
+            still += log_p(as_still, t_s, e)
             long += log_p(as_long, t_s, e)
             sliding += log_p(as_sliding, t_s, e)
             followed += log_p(as_followed, t_s, e)
@@ -79,6 +86,32 @@ def weigh(
     over_still = drone - _log_mean(np.array([still, long, sliding]))
     off2 /= coordinates * len(t_s)
     return over_still, drone - bird, drone - balloon, min(over_still, drone - followed), off2
+
+
+@compiled
+def _as_drone(
+    t_s: Array64,
+    x_m: Array64,
+    odometry_m: Array64,
+    sigma_m: float,
+    level_known: bool,
+    error: tuple[float, float, float, float],
+) -> tuple[float, float]:
+    """ln of the likelihood of a path as that of the odometry, and its squared residual at the best yaw."""
+    upright, up = model_of(t_s, sigma_m, error[1], error[3]), x_m[:, 2] - odometry_m[:, 2]
+    drone, off2 = log_p(upright, t_s, up), misfit(upright, t_s, up)
+    if level_known:
+        as_drone = model_of(t_s, sigma_m, error[0], error[2])
+        turned, level2 = np.empty(YAWS), math.inf
+        for k in range(YAWS):
+            c, s = math.cos(math.tau * k / YAWS), math.sin(math.tau * k / YAWS)
+            ex = x_m[:, 0] - c * odometry_m[:, 0] + s * odometry_m[:, 1]
+            ey = x_m[:, 1] - s * odometry_m[:, 0] - c * odometry_m[:, 1]
+            turned[k] = log_p(as_drone, t_s, ex) + log_p(as_drone, t_s, ey)
+            level2 = min(level2, misfit(as_drone, t_s, ex) + misfit(as_drone, t_s, ey))
+        drone += _log_mean(turned)
+        off2 += level2
+    return drone, off2
 
 
 @compiled

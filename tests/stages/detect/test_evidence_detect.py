@@ -32,10 +32,12 @@ from stages.messages import (
     Candidates,
     Detections,
     DroneLocalPosition,
+    DroneMotion,
     DroneOdometry,
     SearchResult,
     VehicleMotion,
 )
+from stages.odometry.drone.autopilot_estimate import GRAVITY_MPS2
 from tests.stages.caster import (
     Ball,
     Box,
@@ -70,6 +72,21 @@ def motion_at(t_s, velocity_mps=(0.0, 0.0, 0.0)):
         xyz_map_m=t_s * np.asarray(velocity_mps, dtype=np.float64),
         R_map_vehicle=np.eye(3),
         covariance=None,
+    )
+
+
+def drone_motion(t_s):
+    """An IMU interval of a drone without acceleration."""
+    return DroneMotion(
+        stamp_ns=START_NS + round(1e9 * t_s),
+        start_ns=START_NS + round(1e9 * t_s) - 20_000_000,
+        segment=0,
+        specific_force_drone_mps2=np.array([0.0, 0.0, GRAVITY_MPS2]),
+        angular_velocity_drone_radps=np.zeros(3),
+        specific_force_noise=np.full(3, 0.01),
+        angular_velocity_noise=np.full(3, 0.001),
+        up_drone=np.array([0.0, 0.0, 1.0]),
+        autopilot=None,
     )
 
 
@@ -158,7 +175,7 @@ def reasons_of(candidates):
 
 
 def test_ports_are_what_the_graph_wires():
-    optional = {"motion", "drone_position", "drone_odometry", "cue"}
+    optional = {"motion", "drone_position", "drone_odometry", "drone_motion", "cue"}
     assert set(input_ports(EvidenceDetect)) == {"pulses", *optional}
     assert set(output_ports(EvidenceDetect)) == {"candidate_log", "candidates", "detections", "cue_state"}
     assert EvidenceDetect.optional_inputs == optional
@@ -721,6 +738,28 @@ def test_a_trained_model_replaces_the_classifier():
     assert "(-4.0); if not a drone: a balloon" in candidates[-1].reasons[0]
 
 
+def test_without_free_space_the_model_has_no_feature_of_the_surroundings():
+    model = {"feature_version": VERSION, "priors": [(0.0, 0.0)] * 4, "terms": [TERM | {"feature": "free_sectors"}]}
+    for free_space in (True, False):
+        stage, logged = EvidenceDetect(model=model, free_space=free_space), []
+        for pulses in pulses_seen([hovering()], WATCHING, 0.5):
+            logged += [m for m in stage.on_pulses(pulses) if isinstance(m, CandidateLog)]
+        known = ~np.isnan(np.concatenate([m.features[:, NAMES.index("free_sectors")] for m in logged]))
+        assert known.all() if free_space else not known.any()
+
+
+def test_the_imu_is_compared_with_a_candidate_without_the_autopilots_estimate():
+    stage, logged = EvidenceDetect(parked=True), []
+    for k in range(1, 100):
+        stage.on_drone_motion(drone_motion(0.02 * k))
+    for pulses in pulses_seen([Drone(MOVING)], WATCHING, 1.5):
+        logged += [m for m in stage.on_pulses(pulses) if isinstance(m, CandidateLog)]
+    last = dict(zip(NAMES, logged[-1].features[0], strict=True))
+    assert math.isnan(last["over_static_nats"])
+    assert last["imu_over_static_nats"] > 0.0  # a drone may fly straight on
+    assert last["imu_misfit"] < 2.0
+
+
 def test_every_classified_candidate_is_logged_with_its_features():
     stage, logged = EvidenceDetect(sweep_deg=PASS_DEG), []
     for pulses in pulses_seen([Drone(MOVING)], WATCHING, 1.5):
@@ -772,18 +811,6 @@ def test_impossible_settings_are_rejected(settings):
 def test_a_model_that_was_not_trained_or_for_other_features_is_refused(model, text):
     with pytest.raises(ValidationError, match=text):
         EvidenceDetect(model=model)
-
-
-def test_a_trained_model_is_refused_for_another_lidar():
-    model = {
-        "feature_version": VERSION,
-        "priors": [(0.0, 0.0)] * 4,
-        "terms": [{"alternative": 0, "feature": "range_m", "knots": (0.0, 1.0), "values": (0.0, 0.0)}],
-    }
-    with pytest.raises(ValidationError, match=r"for the VLP-16, not for the XT16: train one .* or set `model: null`"):
-        EvidenceDetect(unit={"model": "XT16"}, model=model)
-    for accepted in (None, model | {"lidar_model": "XT16"}):
-        assert EvidenceDetect(unit={"model": "XT16"}, model=accepted).settings.unit.model == "XT16"
 
 
 def test_a_rejected_lamp_is_not_published_again_while_the_drone_flies():

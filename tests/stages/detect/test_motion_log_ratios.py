@@ -181,7 +181,7 @@ def test_swapping_or_mirroring_the_axes_of_both_changes_nothing():
     np.testing.assert_allclose(against(path * [1, 1, -1], odometry * [1, 1, -1]), expected, atol=1e-6)
 
 
-def test_a_mirrored_path_does_not_match():
+def test_a_climbing_path_does_not_match():
     odometry = turning(3.0, 6.0)
     path = odometry + noise()
     assert (
@@ -517,9 +517,7 @@ def test_after_a_reset_a_path_from_before_it_is_not_compared():
 
 def test_only_the_latest_ten_seconds_and_so_many_points_of_them_are_compared(monkeypatch):
     asked = []
-    monkeypatch.setattr(
-        motion_log_ratios, "weigh", lambda t, x, d, sigma_m, level: asked.append((t, x)) or (0.0, 0.0, 0.0, 0.0, 0.0)
-    )
+    monkeypatch.setattr(motion_log_ratios, "weigh", lambda t, x, *_: asked.append((t, x)) or (0.0, 0.0, 0.0, 0.0, 0.0))
     odometry = telemetry_of(circle, seconds=20.0)
     stamps, path = path_of(circle, np.linspace(1.0, 19.0, 181))
     compare_motion(odometry, stamps, path, SIGMA_M, True)
@@ -528,3 +526,49 @@ def test_only_the_latest_ten_seconds_and_so_many_points_of_them_are_compared(mon
     assert (t[0], t[-1]) == pytest.approx((-KEPT_NS / 2e9, 0.0))
     np.testing.assert_allclose(x[[0, -1]], [circle(9.0), circle(19.0)])
     assert np.diff(t) == pytest.approx(np.diff(t).mean(), abs=0.11)
+
+
+# by the IMU alone
+
+
+def by_imu(path_m, imu_m, duration_s=3.0, **changed):
+    """The comparison of a path with an integrated IMU whose velocity is 7 m/s wrong, in a frame with another yaw."""
+    telemetry, t_s = DroneTelemetry(), np.arange(0.0, duration_s + 0.1, 0.02)
+    for t in t_s:
+        position_m, soon = (rotation_z(2.0) @ (imu_m(x) + x * np.array([7.0, -2.0, 1.0])) for x in (t, t + 1e-3))
+        telemetry.add(START_NS + round(t * 1e9), position_m, (soon - position_m) / 1e-3)
+    times = np.arange(0.1, duration_s, 0.1)
+    rng = np.random.default_rng(4)
+    path = [path_m(t) + rng.normal(0, 0.06, 3) for t in times]
+    stamps = [START_NS + round(t * 1e9) for t in times]
+    return compare_motion(telemetry, stamps, path, 0.08, True, by_imu=True, **changed)
+
+
+def weaving(t):
+    """1.6 m/s^2 on both sides while it flies straight on."""
+    return np.array([2.0 * t, 0.8 * math.sin(1.4 * t), 0.0])
+
+
+def test_the_imu_alone_tells_the_drone_from_everything_that_accelerates_otherwise():
+    own = by_imu(weaving, weaving)
+    assert min(own[:3]) > 3.0
+    assert own.misfit < 1.5
+    climbing = by_imu(lambda t: weaving(t) + np.array([0.0, 0.0, 0.8 * math.sin(1.4 * t)]), weaving)
+    assert climbing.over_bird < min(own.over_bird, 3.0)
+    assert by_imu(lambda t: np.zeros(3), weaving).over_static < -3.0
+    assert by_imu(lambda t: np.array([8.0 * t, 0.0, 0.0]), weaving).over_bird < 0.0
+
+
+def test_the_imu_of_a_drone_without_acceleration_tells_it_from_nothing_that_flies_straight():
+    straight = by_imu(lambda t: np.array([3.0 * t, 0.0, 0.0]), lambda t: np.zeros(3))
+    assert straight.over_static > 5.0
+    still = by_imu(lambda t: np.zeros(3), lambda t: np.zeros(3))
+    assert abs(still.over_static) < 1.0
+
+
+def test_an_old_part_of_the_path_is_not_compared_with_the_imu(monkeypatch):
+    monkeypatch.setattr(motion_log_ratios, "IMU_NS", 1_000_000_000)
+    late = lambda t: weaving(t) if t > 1.0 else np.array([50.0, 0.0, 0.0])  # noqa: E731
+    assert by_imu(late, weaving).misfit < 1.5
+    monkeypatch.setattr(motion_log_ratios, "IMU_NS", 3_000_000_000)
+    assert by_imu(late, weaving).misfit > MAX_MISFIT

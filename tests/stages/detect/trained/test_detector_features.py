@@ -14,7 +14,8 @@ from stages.geometry.frames import rotation_z
 from stages.kernels.detect.isolation import FREE_0, SECTORS
 from tests.stages.detect.test_candidate import PLACE_M, candidate, observation, path
 
-TELEMETRY = tuple(NAMES[NAMES.index("over_static_nats") :])
+TELEMETRY = tuple(NAMES[NAMES.index("over_static_nats") : NAMES.index("imu_over_static_nats")])
+IMU = tuple(NAMES[NAMES.index("imu_over_static_nats") :])
 MOTION = (
     "relative_speed_mps", "acceleration_mps2", "top_mps", "scatter_m", "straight_mps",
     "climb_mps",
@@ -33,9 +34,9 @@ def test_the_names_are_distinct_and_each_has_a_text():
 def test_after_one_observation_no_motion_is_known():
     features = named(candidate(observation(0.0)))
     assert all(
-        math.isnan(features[name]) for name in (*MOTION, *TELEMETRY, "displacement_m", "passes_since_reacquired")
+        math.isnan(features[name]) for name in (*MOTION, *TELEMETRY, *IMU, "displacement_m", "passes_since_reacquired")
     )
-    known = set(NAMES) - set(MOTION) - set(TELEMETRY) - {"displacement_m", "passes_since_reacquired"}
+    known = set(NAMES) - set(MOTION) - set(TELEMETRY) - set(IMU) - {"displacement_m", "passes_since_reacquired"}
     known -= {"straight_sigmas"}
     assert all(math.isfinite(features[name]) for name in known)
 
@@ -86,6 +87,14 @@ def test_telemetry_is_a_part_of_the_same_features():
     assert [features[name] for name in TELEMETRY] == [5.0, 4.0, 3.0, 1.1, 5.0]
     c.add_log_ratios(None)
     assert all(math.isnan(named(c)[name]) for name in TELEMETRY)
+
+
+def test_the_imu_is_a_part_of_the_same_features():
+    c = candidate(*path((1.0, 0.0, 0.0)))
+    c.imu_log_ratios = MotionLogRatios(5.0, 4.0, 3.0, 2.0, 1.1, 0.9)
+    features = named(c)
+    assert [features[name] for name in IMU] == [5.0, 4.0, 3.0, 1.1]
+    assert all(math.isnan(features[name]) for name in TELEMETRY)
 
 
 def test_repeated_observations_raise_the_existence_and_distant_ones_do_not():

@@ -37,12 +37,12 @@ def test_the_gate(benchmark: Any):
 
 def test_a_pose_to_a_frame(benchmark: Any):
     mav = mavlink.MAVLink(None, srcSystem=1, srcComponent=197)
-    benchmark(lambda: packed(odometry(good_pose(), 0, LIMITS), mav))
+    benchmark(lambda: packed(odometry(good_pose(), 0.0, 0, LIMITS), mav))
 
 
 def test_pymavlink_packing_the_same_message(benchmark: Any):
     mav = mavlink.MAVLink(None, srcSystem=1, srcComponent=197)
-    message = odometry(good_pose(), 0, LIMITS)
+    message = odometry(good_pose(), 0.0, 0, LIMITS)
     benchmark(lambda: packed(message, mav))
 
 

@@ -35,7 +35,14 @@ def preflight(
         Path | None, typer.Option("--recording", help="Check a recording instead of what is connected.")
     ] = None,
     for_s: Annotated[
-        float, typer.Option("--for", min=0.5, max=600, metavar="SECONDS", help="Live: observation time.")
+        float,
+        typer.Option(
+            "--for",
+            min=0.5,
+            max=600,
+            metavar="SECONDS",
+            help="Live: observation time, from when every source has sent.",
+        ),
     ] = 5.0,
     out_dir: Annotated[
         Path, typer.Option("--out", help="Live: the output folder of `grd run`; its disk is checked.")

@@ -80,7 +80,7 @@ class ObservationTap(Tap):
             observation.add(record)
 
     @property
-    def all_began(self) -> bool:
+    def every_source_has_sent(self) -> bool:
         """Whether every source has sent at least one record."""
         return all(self._by_topic[topic].records.count for topic in self._topics.values())
 

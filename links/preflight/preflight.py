@@ -20,7 +20,7 @@ from links.preflight.observations import Observations
 from links.recording import Progress, Session
 from stages.messages import DroneAttitude, DroneOdometry
 
-POLL_S = 0.05  # while sources begin
+POLL_S = 0.05  # interval of the check whether every source has sent
 OUT_DIR = Path("out")  # default folder for the output of `grd run`
 
 Wait = Callable[[float], None]
@@ -44,7 +44,7 @@ def preflight_live(
     configuration lacks is judged by it.
     """
     with simulated_rig(graph):
-        observations = collect_live(sources_only(graph), lambda tap: _observe(tap, wait, seconds))
+        observations = collect_live(sources_only(graph), lambda tap: observe(tap, wait, seconds))
         yield from link_checks(graph, observations, out_dir, whole)
         if not _has_attitude(observations):
             return
@@ -60,10 +60,13 @@ def preflight_live(
         yield from motion_checks(observations)
 
 
-def _observe(tap: ObservationTap, wait: Wait, seconds: float) -> None:
-    """Wait until every source has begun, for at most `seconds`, then for `seconds`: a process takes time to start."""
+def observe(tap: ObservationTap, wait: Wait, seconds: float) -> None:
+    """Wait for `seconds` from when every source has sent a record: the process of a driver takes time to start.
+
+    A source that sends nothing is waited for at most as long again.
+    """
     waited_s = 0.0
-    while not tap.all_began and waited_s < seconds:
+    while not tap.every_source_has_sent and waited_s < seconds:
         wait(POLL_S)
         waited_s += POLL_S
     wait(seconds)

@@ -25,7 +25,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stages.geometry.frames import Array64
+from stages.geometry.frames import Array64, level_axes
 from stages.kernels.align.spectra import BIN_RAD, BINS, add_kernels
 from stages.messages import VanishingDirections
 
@@ -49,15 +49,6 @@ class LevelLines:
     azimuth_rad: Array64  # (m,) in [0, pi)
     azimuth_sigma_rad: Array64  # (m,)
     weight: Array64  # (m,) length [rad], no more than LONG_RAD
-
-
-def level_axes(up: Array64) -> Array64:
-    """R_carrier_level (3, 3): z is `up` (3,), x is the levelled x axis of the camera mount (y where x is upright)."""
-    z = up / np.linalg.norm(up)
-    forward = np.array([1.0, 0.0, 0.0]) if abs(z[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
-    x = forward - (forward @ z) * z
-    x /= np.linalg.norm(x)
-    return np.column_stack([x, np.cross(z, x), z])
 
 
 def level_lines(seen: VanishingDirections, sharpest_rad: float) -> LevelLines | None:

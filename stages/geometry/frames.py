@@ -98,6 +98,15 @@ def heading_rad(R: Array64) -> float:
     return math.atan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1])
 
 
+def level_axes(up: Array64) -> Array64:
+    """R_body_level (3, 3): z is `up` (3,) in body axes, x the levelled x axis of the body (y where x is upright)."""
+    z = up / np.linalg.norm(up)
+    forward = np.array([1.0, 0.0, 0.0]) if abs(z[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
+    x = forward - (forward @ z) * z
+    x /= np.linalg.norm(x)
+    return np.column_stack([x, np.cross(z, x), z])
+
+
 def transform(rotation: Array64, translation_m: Array64) -> Array64:
     """T_a_b (4, 4) from R_a_b (3, 3) and the origin of b in a (3,)."""
     T = np.eye(4)

@@ -1,6 +1,6 @@
-"""Path of the drone by its IMU alone: level, with any yaw, and an unknown velocity at its start.
+"""Path of the drone by its IMU alone, in a level frame of any yaw, with an unknown velocity at its start.
 
-    R <- exp(k up x z) R exp(w dt),    a = R f - g,    v <- v + a dt,    x <- x + v dt + a dt^2 / 2
+    R <- exp(k (R up) x z) R exp(w dt),    a = R f - g,    v <- v + a dt,    x <- x + v dt + a dt^2 / 2
 
 The vertical is corrected by the autopilot's roll and pitch, k = (time since the last correction) / TILT_S. Its yaw,
 position and velocity are not used, so that the path never contains a pose that was sent to it. A detector compares its
@@ -11,11 +11,9 @@ Source: ours; Titterton, Weston, Strapdown Inertial Navigation Technology (2004)
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
-from stages.geometry.frames import Array64
+from stages.geometry.frames import Array64, level_axes
 from stages.kernels.geometry.so3 import exp_rotation
 from stages.messages import DroneMotion
 from stages.odometry.drone.autopilot_estimate import GRAVITY_MPS2
@@ -41,7 +39,7 @@ class InertialPath:
             self._segment, self._R_level_drone, self.path = motion.segment, None, DroneTelemetry()
             self._xyz_m, self._velocity_mps = np.zeros(3), np.zeros(3)
         if self._R_level_drone is None:
-            self._R_level_drone = None if motion.up_drone is None else _level(motion.up_drone)
+            self._R_level_drone = None if motion.up_drone is None else level_axes(motion.up_drone).T
             self._levelled_ns = motion.stamp_ns
             return
         dt = (motion.stamp_ns - motion.start_ns) * 1e-9
@@ -59,11 +57,3 @@ class InertialPath:
         self._xyz_m = self._xyz_m + dt * (self._velocity_mps + 0.5 * dt * acceleration_mps2)
         self._velocity_mps = self._velocity_mps + dt * acceleration_mps2
         self.path.add(motion.stamp_ns, self._xyz_m, self._velocity_mps)
-
-
-def _level(up_drone: Array64) -> Array64:
-    """A rotation (3, 3), level from drone, that takes the vertical in drone axes to z."""
-    x, y, z = up_drone
-    across = math.hypot(x, y)
-    axis = np.array([y, -x, 0.0]) / across if across > 0.0 else np.array([1.0, 0.0, 0.0])
-    return exp_rotation(math.atan2(across, z) * axis)

@@ -15,7 +15,8 @@ from flow.graph import Graph, load_graph
 from links.cli.app import app
 from links.lidar.decode import compile_kernels
 from links.preflight.check_result import Level, is_go
-from links.preflight.preflight import preflight_live
+from links.preflight.collect import ObservationTap
+from links.preflight.preflight import observe, preflight_live
 from links.simulated.autopilot.ardupilot_rules import ArduPilotRules
 from links.simulated.autopilot.autopilot_socket import AutopilotSocket
 from links.simulated.sensors.dynamixel_emulator import DynamixelEmulator
@@ -138,6 +139,19 @@ def test_a_wrong_parameter_and_an_inverted_axis_fail(bench, emulator):
     assert {n for n, v in found.items() if v.level is Level.FAIL} == {"autopilot parameters", "axes: accelerometer"}
     assert "EK3_SRC2_YAW is 6, but must be 1 or 2 or 3" in found["autopilot parameters"].sentence
     assert "z is measured as -z" in found["axes: accelerometer"].sentence
+
+
+@pytest.mark.parametrize(("sends_after", "waited_s"), [(0, 2.0), (10, 2.5), (1000, 4.0)])
+def test_the_observation_begins_when_every_source_has_sent(sends_after, waited_s):
+    waits = []
+
+    class Starting(ObservationTap):
+        @property
+        def every_source_has_sent(self) -> bool:
+            return len(waits) >= sends_after
+
+    observe(Starting(), waits.append, 2.0)
+    assert sum(waits) == pytest.approx(waited_s, abs=0.06)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,6 @@ from stages.align.spectra import (
     QUARTER,
     LevelLines,
     Peak,
-    level_axes,
     level_lines,
     match_probabilities,
     nearby,
@@ -22,6 +21,7 @@ from stages.align.spectra import (
     quarter_difference,
     spectrum,
 )
+from stages.geometry.frames import level_axes
 from stages.kernels.align.spectra import BIN_RAD, BINS
 from stages.messages import CameraMount
 from tests.stages.align.made_lines import ATLANTA, CAMPUS, MANHATTAN, nothing, seen, turned

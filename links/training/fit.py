@@ -42,25 +42,23 @@ FOLDS = 3
 EASY_SHARE = 0.05  # assumed; of the single observations without telemetry that are used; they are most of all rows
 USED: tuple[tuple[str, ...], ...] = (  # features of each alternative
     (
-        "existence_nats", "false_per_s", "range_m", "scan_passes", "age_s", "first_returns", "return_ratio",
-        "return_count_nats", "passed_pulses", "missed_returns", "neighbour_score",
+        "existence_nats", "false_per_s", "range_m", "scan_passes", "first_returns", "return_ratio", "passed_pulses",
+        "missed_returns", "neighbour_score",
     ),
     (
         "range_m", "scan_passes", "return_count_nats", "free_sectors", "least_free", "neighbour_score",
-        "isolated_score", "large_object_m", "large_object_share", "extent_ratio", "largest_extent_ratio",
-        "too_long_passes", "scatter_m", "displacement_m", "straight_mps", "straight_sigmas", "moves", "near_rejected",
-        "revisited", "displaced_nats", "misfit", "passes_since_reacquired", "imu_over_static_nats", "imu_misfit",
+        "isolated_score", "large_object_m", "large_object_share", "too_long_passes", "straight_sigmas", "moves",
+        "near_rejected", "revisited", "displaced_nats", "passes_since_reacquired", "imu_over_static_nats",
     ),
     (
-        "range_m", "age_s", "return_ratio", "extent_ratio", "top_mps", "relative_speed_mps", "acceleration_mps2",
-        "fastest_mps", "hardest_mps2", "calm_s", "steady_s", "scatter_m", "straight_sigmas", "climb_mps",
-        "over_bird_nats", "misfit", "imu_over_bird_nats", "imu_misfit",
+        "range_m", "return_ratio", "top_mps", "relative_speed_mps", "acceleration_mps2", "fastest_mps", "hardest_mps2",
+        "calm_s", "over_bird_nats", "imu_over_bird_nats",
     ),
     ("range_m", "round_chords", "rough_chords", "straight_mps", "over_balloon_nats", "imu_over_balloon_nats"),
 )  # fmt: skip
 RANGED = {  # features whose weight depends on the range: their terms are near and far
     "scan_passes", "first_returns", "return_ratio", "free_sectors", "neighbour_score", "isolated_score",
-    "displaced_nats", "extent_ratio",
+    "displaced_nats",
 }  # fmt: skip
 
 
@@ -182,7 +180,7 @@ def _of_term(term: Term) -> list[_Column]:
 
 def _missing(alternative: int, name: str, at: At, mean: float) -> list[_Column]:
     """The parameter of a missing feature; a log likelihood ratio that is missing is no evidence."""
-    if name.endswith(("_nats", "misfit")):
+    if name.endswith("_nats"):
         return []
     return [_Column(alternative, name, at, np.nan, np.nan, 0, mean)]
 

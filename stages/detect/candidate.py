@@ -60,7 +60,6 @@ class Observation:
     rough_chords: int  # chords with enough returns to bulge smoothly that do not
     isolation: Array64  # (TALLY,) sector counts, see stages/detect/isolation.py
     large_object_m: float  # distance to the nearest large object; inf: none
-    extent_m: float = 0.0  # largest distance between its chords, or length of one
 
 
 @dataclass(slots=True, eq=False)
@@ -76,13 +75,10 @@ class Candidate:
     first_returns: int
     scan_passes: int = 1  # passes of the rotor in which it was observed
     missed_returns: float = 0.0  # expected returns that did not come
-    born_ns: int = 0  # its first observation
     existence_nats: float = 0.0  # log-odds that one object causes its observations, see trained/existence.py
     false_per_s: float = LEAST_FALSE_PER_S  # rate of false returns at its range, at its last observation
     passed_pulses: float = 0.0  # pulses through its middle in scan passes without a return
     observations: int = 0
-    total_extent_m: float = 0.0  # sum and largest of its observations
-    largest_extent_m: float = 0.0
     features: Array64 = field(default_factory=lambda: np.zeros(0))  # at its newest classification
     returns: int = 0
     too_long_passes: int = 0
@@ -159,8 +155,6 @@ class Candidate:
     def add_observation(self, s: Observation) -> None:
         """Add the evidence of one observation, without the filter update."""
         self.observations += 1
-        self.total_extent_m += s.extent_m
-        self.largest_extent_m = max(self.largest_extent_m, s.extent_m)
         self.returns += s.returns
         self.too_long_passes += s.too_long
         alone = min(max(SINGLE_RETURN_PER_M * s.range_m, 0.1), 0.7)
@@ -201,11 +195,12 @@ class Candidate:
     def add_log_ratios(self, log_ratios: MotionLogRatios | None) -> None:
         """Store the newest comparison with telemetry, and its best value reached in open air.
 
+        None: there is no telemetry now. What the candidate's path showed before remains: it is the same object.
         Evidence of flight in open air remains when the candidate comes near an object, unless telemetry contradicts it.
         """
-        self.log_ratios = log_ratios
         if log_ratios is None:
             return
+        self.log_ratios = log_ratios
         if log_ratios.over_static < DENIED:
             self.flight_log_ratio = 0.0
         elif self.neighbour_score < OPEN_NEIGHBOUR_SCORE and log_ratios.displacement_m > self.apparent_motion_m:

@@ -235,7 +235,6 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
             range_m=s.range_m,
             p=(SIGMA_M**2, 0.0, START_SPEED_MPS**2),
             first_returns=s.returns,
-            born_ns=s.stamp_ns,
             false_per_s=now.false_returns.per_s(s.range_m, s.stamp_ns),
         )
         new.existence_nats = birth_nats(new.false_per_s)

@@ -132,14 +132,12 @@ def moves(path_ns: list[int], path_m: list[Array64], range_m: float, motion_know
     return duration_s > 1.0 and speed > 4.0 * sigma and speed * duration_s > 1.5
 
 
-def straight_flight(path_ns: list[int], path_m: list[Array64], range_m: float) -> tuple[float, float, float]:
-    """(speed [m/s], the same in sigmas, climb [m/s]) of a straight line through a path; NaN: under three positions."""
+def straight_flight(path_ns: list[int], path_m: list[Array64], range_m: float) -> tuple[float, float]:
+    """(speed [m/s], the same in sigmas) of a straight line through a path; NaN: under three positions."""
     if len(path_ns) < 3 or path_ns[-1] == path_ns[0]:
-        return math.nan, math.nan, math.nan
-    t, x = (np.array(path_ns) - path_ns[-1]) * 1e-9, np.array(path_m)
-    speed, sigma, _ = _straight(t, x, range_m)
-    since = t - t.mean()
-    return speed, speed / sigma, float(since @ x[:, 2] / (since @ since))
+        return math.nan, math.nan
+    speed, sigma, _ = _straight((np.array(path_ns) - path_ns[-1]) * 1e-9, np.array(path_m), range_m)
+    return speed, speed / sigma
 
 
 def _straight(t: Array64, x: Array64, range_m: float) -> tuple[float, float, float]:

@@ -84,9 +84,10 @@ def compare_motion(
     rows, odometry_m = list(positions), np.array(list(positions.values()))
     t = (np.array([path_ns[k] for k in rows]) - path_ns[rows[-1]]) * 1e-9
     if by_imu:
-        odometry_m -= np.outer(
-            (t - t[0]) / (t[-1] - t[0]), odometry_m[-1] - odometry_m[0]
-        )  # its mean velocity is unknown
+        if t[0] == t[-1]:
+            return None
+        moved_m = odometry_m[-1] - odometry_m[0]  # by its mean velocity, which is not known
+        odometry_m -= np.outer((t - t[0]) / (t[-1] - t[0]), moved_m)
     compared_m = odometry_m if level_known else odometry_m[:, 2:]
     displacement_m = float(np.sqrt(((compared_m - compared_m[0]) ** 2).sum(axis=1).max()))
     x_m = np.array([path_m[k] for k in rows])

@@ -116,7 +116,6 @@ class ObservationFinder:
             range_m=range_m,
             returns=returns,
             too_long=extent_m > 1.3 * span_m,
-            extent_m=extent_m,
             round_chords=round_chords,
             rough_chords=rough,
             isolation=self._isolation(middle, range_m),

@@ -3,6 +3,9 @@
 `features_of` is a pure function of a candidate's history. A feature that is not available (no telemetry, too few
 observations for a speed) is NaN. VERSION changes with the list or the meaning of a feature.
 
+Each is monotone but the range: what has no sign by physics, as the climb or the age of a candidate, is specific to the
+flights of a simulator and misleads in other skies (docs/reference/detection.md).
+
 Features depend on the classifier of the run, which decides which candidates are kept and counted. Train on replays with
 the classifier that the model replaces, then again on replays with the model.
 
@@ -21,14 +24,14 @@ from stages.detect.flight import Motion, straight_flight
 from stages.detect.motion_log_ratios import MotionLogRatios
 from stages.geometry.frames import Array64
 
-VERSION = 4
+VERSION = 6
 PULSE_RAD = math.radians(0.2)  # between two pulses of a laser: VLP-16, 600 rpm
 NONE_M = 4.0  # written where no large object is near
 NOT_DISPLACED_NATS = 3.0  # cap of the log ratio over a static object that may seem to move as far
 
 
 class Feature(NamedTuple):
-    """A feature: `monotone` +1 or -1 where physics demands that it makes a drone more or less probable, else 0."""
+    """A feature: `monotone` +1 or -1, whether it makes a drone more or less probable by physics; 0 for the range."""
 
     name: str
     monotone: int
@@ -40,49 +43,40 @@ FEATURES: tuple[Feature, ...] = (
     Feature("range_m", 0, "range", "range"),
     Feature("existence_nats", 1, "existence by returns and pass-throughs", "existence"),
     Feature("false_per_s", -1, "false returns at this range", "existence"),
-    Feature("scan_passes", 0, "scan passes with a return", "existence"),
-    Feature("age_s", 0, "time since the first observation", "existence"),
-    Feature("first_returns", 0, "returns of the first scan pass", "returns"),
-    Feature("return_ratio", 0, "returns over those of a beam across the drone", "returns"),
-    Feature("return_count_nats", 0, "returns of each scan pass, as a drone's and not a wire's", "returns"),
+    Feature("scan_passes", 1, "scan passes with a return", "existence"),
+    Feature("first_returns", 1, "returns of the first scan pass", "returns"),
+    Feature("return_ratio", 1, "returns over those of a beam across the drone", "returns"),
+    Feature("return_count_nats", 1, "returns of each scan pass, as a drone's and not a wire's", "returns"),
     Feature("passed_pulses", -1, "pulses that passed through its middle", "existence"),
     Feature("missed_returns", -1, "returns expected of these pulses", "existence"),
     Feature("free_sectors", 1, "sectors around it that pulses flew through", "surroundings"),
-    Feature("least_free", 0, "scan passes in which its least observed sector was free", "surroundings"),
+    Feature("least_free", 1, "scan passes in which its least observed sector was free", "surroundings"),
     Feature("neighbour_score", -1, "objects next to it", "surroundings"),
-    Feature("isolated_score", 0, "recent scan passes without a neighbour", "surroundings"),
-    Feature("large_object_m", 0, "distance to a wall, crown or trunk", "surroundings"),
+    Feature("isolated_score", 1, "recent scan passes without a neighbour", "surroundings"),
+    Feature("large_object_m", 1, "distance to a wall, crown or trunk", "surroundings"),
     Feature("large_object_share", -1, "share of scan passes next to a large object", "surroundings"),
-    Feature("extent_ratio", 0, "mean extent over the drone's", "size and shape"),
-    Feature("largest_extent_ratio", 0, "largest extent over the drone's", "size and shape"),
-    Feature("too_long_passes", -1, "scan passes in which it was longer than the drone", "size and shape"),
-    Feature("round_chords", -1, "smooth, round chords", "size and shape"),
-    Feature("rough_chords", 0, "chords that are not smooth", "size and shape"),
-    Feature("relative_speed_mps", 0, "speed relative to the vehicle", "motion"),
-    Feature("acceleration_mps2", 0, "acceleration", "motion"),
-    Feature("fastest_mps", 0, "highest speed that it significantly had", "motion"),
-    Feature("hardest_mps2", 0, "highest acceleration that it significantly had", "motion"),
-    Feature("top_mps", 0, "speed that it reaches, with its turn", "motion"),
+    Feature("too_long_passes", -1, "scan passes in which it was longer than the drone", "shape"),
+    Feature("round_chords", -1, "smooth, round chords", "shape"),
+    Feature("rough_chords", 1, "chords that are not smooth", "shape"),
+    Feature("relative_speed_mps", -1, "speed relative to the vehicle", "motion"),
+    Feature("acceleration_mps2", -1, "acceleration", "motion"),
+    Feature("fastest_mps", -1, "highest speed that it significantly had", "motion"),
+    Feature("hardest_mps2", -1, "highest acceleration that it significantly had", "motion"),
+    Feature("top_mps", -1, "speed that it reaches, with its turn", "motion"),
     Feature("calm_s", 1, "time in which it flew more calmly than a bird cruises", "motion"),
-    Feature("steady_s", 1, "time in which it flew straight", "motion"),
-    Feature("scatter_m", 0, "scatter about a smooth path", "motion"),
-    Feature("displacement_m", 0, "displacement since the first observation kept", "motion"),
-    Feature("straight_mps", 0, "mean velocity since then", "motion"),
-    Feature("straight_sigmas", 0, "the same in its sigmas", "motion"),
-    Feature("climb_mps", 0, "mean vertical velocity", "motion"),
-    Feature("moves", 0, "it moved over ground", "motion"),
+    Feature("straight_mps", 1, "mean velocity since then", "motion"),
+    Feature("straight_sigmas", 1, "the same in its sigmas", "motion"),
+    Feature("moves", 1, "it moved over ground", "motion"),
     Feature("near_rejected", -1, "a rejected object near it", "surroundings"),
     Feature("revisited", -1, "a rejected object at its position", "surroundings"),
     Feature("passes_since_reacquired", 1, "scan passes since it was reacquired", "telemetry"),
     Feature("over_static_nats", 1, "moves as the drone's odometry, not as a static object", "telemetry"),
     Feature("over_bird_nats", 1, "moves as the drone's odometry, not as a bird", "telemetry"),
     Feature("over_balloon_nats", 1, "moves as the drone's odometry, not as a balloon", "telemetry"),
-    Feature("misfit", -1, "residual from the drone's odometry", "telemetry"),
     Feature("displaced_nats", 1, "moves as the drone's odometry, farther than a static one seems to", "telemetry"),
     Feature("imu_over_static_nats", 1, "accelerates as the drone's IMU, not as a static object", "imu"),
     Feature("imu_over_bird_nats", 1, "accelerates as the drone's IMU, not as a bird", "imu"),
     Feature("imu_over_balloon_nats", 1, "accelerates as the drone's IMU, not as a balloon", "imu"),
-    Feature("imu_misfit", -1, "residual from the drone's IMU", "imu"),
 )
 GROUPS = tuple(dict.fromkeys(feature.group for feature in FEATURES))
 NAMES = tuple(feature.name for feature in FEATURES)
@@ -91,7 +85,7 @@ TELEMETRY = NAMES.index("over_static_nats")  # NaN: not compared with telemetry
 FREE_SPACE = tuple(
     NAMES.index(name) for name in ("free_sectors", "least_free", "neighbour_score", "isolated_score")
 )  # measured around a candidate
-NO_TELEMETRY = (math.nan,) * 5
+NO_TELEMETRY = (math.nan,) * 4
 NO_IMU = NO_TELEMETRY[1:]
 
 
@@ -100,20 +94,18 @@ def features_of(c: Candidate, span_m: float, motion_known: bool) -> Array64:
 
     `span_m`: of the drone; `motion_known`: whether positions in frame map are those over ground.
     """
-    n = len(c.path_ns)
     passes = float(c.scan_passes)
     m, slower = c.motion or NOT_MEASURED, c.slower_motion or NOT_MEASURED
-    speed, sigmas, climb = straight_flight(c.path_ns, c.path_m, c.range_m)
+    speed, sigmas = straight_flight(c.path_ns, c.path_m, c.range_m)
     ratios, imu = c.log_ratios, c.imu_log_ratios
     since = math.nan if not c.reacquired_at else passes - c.reacquired_at
-    telemetry = NO_TELEMETRY if ratios is None else (*ratios[:3], ratios.misfit, displaced_nats(c, ratios))
+    telemetry = NO_TELEMETRY if ratios is None else (*ratios[:3], displaced_nats(c, ratios))
     return np.array(
         [
             c.range_m,
             c.existence_nats,
             c.false_per_s,
             passes,
-            (c.path_ns[-1] - c.born_ns) * 1e-9,
             c.first_returns,
             c.returns / c.observations * PULSE_RAD * c.range_m / span_m,
             c.return_count_nats,
@@ -125,8 +117,6 @@ def features_of(c: Candidate, span_m: float, motion_known: bool) -> Array64:
             c.isolated_score,
             min(c.large_object_m, NONE_M),
             c.large_object_passes / c.observations,
-            c.total_extent_m / c.observations / span_m,
-            c.largest_extent_m / span_m,
             c.too_long_passes,
             c.round_chords,
             c.rough_chords,
@@ -136,18 +126,14 @@ def features_of(c: Candidate, span_m: float, motion_known: bool) -> Array64:
             c.hardest_mps2,
             slower.top_mps,
             c.calm_s,
-            c.steady_s,
-            m.spread_m,
-            math.dist(c.path_m[0], c.path_m[-1]) if n > 1 else math.nan,
             speed,
             sigmas,
-            climb,
             c.moves(motion_known),
             c.near_rejected,
             c.revisited,
             since,
             *telemetry,
-            *(NO_IMU if imu is None else (*imu[:3], imu.misfit)),
+            *(NO_IMU if imu is None else imu[:3]),
         ],
         dtype=np.float64,
     )

@@ -17,7 +17,9 @@ YAWS = 72  # steps of 5 deg: coarser, a fast straight flight fits none
 DRIFT_MPS = 0.3  # horizontal velocity drift of autopilot and vehicle together
 DRIFT_UP_MPS = 0.1
 BY_ODOMETRY = (DRIFT_MPS, DRIFT_UP_MPS, 0.0, 0.0)  # sigmas of its error: velocity, level and up; acceleration, the same
-BY_IMU = (6.0, 2.0, 0.35, 0.2)  # its velocity is not known; roll and pitch of the autopilot are 2 deg wrong
+IMU_MPS2, IMU_UP_MPS2 = 0.35, 0.2  # roll and pitch 2 deg wrong; bias of the accelerometer
+BY_IMU = (6.0, 2.0, IMU_MPS2, IMU_UP_MPS2)  # its velocity is not known
+HOVERING = (DRIFT_MPS, DRIFT_UP_MPS, IMU_MPS2, IMU_UP_MPS2)  # or nearly zero: half of the drones, assumed
 SCATTERED_M = 0.45  # scatter of the sightings of a long object
 SLIDING_MPS = 0.5  # or speed at which sightings move along it
 FOLLOWED_MPS = 5.0  # the same along a wire, where each pass is aimed as at a flying object
@@ -46,15 +48,16 @@ def weigh(
         x[:, axis] -= x[:, axis].mean()
         d[:, axis] -= d[:, axis].mean()
     drone, off2 = _as_drone(t_s, x, d, sigma_m, level_known, error)
-    if error != BY_ODOMETRY:  # it may also hover
-        drone = _log_sum(drone, _as_drone(t_s, x, d, sigma_m, level_known, BY_ODOMETRY)[0]) - math.log(2.0)
-    as_still = model_of(t_s, sigma_m, DRIFT_MPS, 0.0)
+    if error == BY_IMU:
+        drone = _log_sum(drone, _as_drone(t_s, x, d, sigma_m, level_known, HOVERING)[0]) - math.log(2.0)
+    as_still = model_of(t_s, sigma_m, DRIFT_MPS, error[2])
     as_long = model_of(t_s, SCATTERED_M, 0.0, 0.0)
-    as_sliding, as_followed = model_of(t_s, sigma_m, SLIDING_MPS, 0.0), model_of(t_s, sigma_m, FOLLOWED_MPS, 0.0)
+    as_sliding = model_of(t_s, sigma_m, SLIDING_MPS, error[2])
+    as_followed = model_of(t_s, sigma_m, FOLLOWED_MPS, error[2])
     up = x[:, 2].copy()
     coordinates = 3.0 if level_known else 1.0
-    # a static object has the same drift
-    still, long = log_p(model_of(t_s, sigma_m, DRIFT_UP_MPS, 0.0), t_s, up), log_p(as_long, t_s, up)
+    # a static object has the same errors, so that a drone that hovers is neither more nor less probable
+    still, long = log_p(model_of(t_s, sigma_m, DRIFT_UP_MPS, error[3]), t_s, up), log_p(as_long, t_s, up)
     sliding = followed = still
     bird = log_p(model_of(t_s, sigma_m, BIRD[2], BIRD[3]), t_s, up)
     sway_mps = SWAY_M / max(t_s.max() - t_s.min(), 1e-3)

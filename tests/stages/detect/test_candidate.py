@@ -36,7 +36,6 @@ def observation(t_s, xyz_m=PLACE_M, returns=3, range_m=20.0):
         rough_chords=0,
         isolation=np.zeros(TALLY, dtype=np.int64),
         large_object_m=math.inf,
-        extent_m=0.3,
     )
 
 

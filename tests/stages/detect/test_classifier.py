@@ -346,8 +346,7 @@ def test_a_candidate_with_constant_neighbours_has_not_flown_in_open_air():
 
 
 def test_without_telemetry_next_to_a_wall_there_is_no_flight_in_open_air():
-    c = come_to_a_wall(log_ratios_of(20.0, 9.0, 9.0, 15.0))
-    c.add_log_ratios(None)
+    c = come_to_a_wall(None)
     assert over_clutter(c, E, True, True)[0] < -8.0
 
 

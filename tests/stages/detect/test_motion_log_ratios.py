@@ -566,6 +566,12 @@ def test_the_imu_of_a_drone_without_acceleration_tells_it_from_nothing_that_flie
     assert abs(still.over_static) < 1.0
 
 
+def test_two_observations_at_one_time_have_no_acceleration():
+    telemetry = telemetry_of(circle, seconds=2.0)
+    stamps, path = path_of(circle, np.array([1.0, 1.0]))
+    assert compare_motion(telemetry, stamps, path, SIGMA_M, True, by_imu=True) is None
+
+
 def test_an_old_part_of_the_path_is_not_compared_with_the_imu(monkeypatch):
     monkeypatch.setattr(motion_log_ratios, "IMU_NS", 1_000_000_000)
     late = lambda t: weaving(t) if t > 1.0 else np.array([50.0, 0.0, 0.0])  # noqa: E731

@@ -118,7 +118,7 @@ class Candidate:
     relative_path_m: list[Array64] = field(default_factory=lambda: list[Array64]())  # relative to the vehicle
     # positions in the map frame [m] at which a neighbour was measured, each with its faded weight
     neighbours: list[tuple[Array64, float]] = field(default_factory=lambda: list[tuple[Array64, float]]())
-    log_ratios: MotionLogRatios | None = None  # its path compared with the drone's telemetry; None: no telemetry
+    log_ratios: MotionLogRatios | None = None  # newest comparison of its path with telemetry; None: none yet
     imu_log_ratios: MotionLogRatios | None = None  # the same by its IMU alone; None: no IMU
     flight_log_ratio: float = 0.0  # highest log ratio over a static object or wire reached in open air [nats]
 
@@ -195,7 +195,7 @@ class Candidate:
     def add_log_ratios(self, log_ratios: MotionLogRatios | None) -> None:
         """Store the newest comparison with telemetry, and its best value reached in open air.
 
-        None: there is no telemetry now. What the candidate's path showed before remains: it is the same object.
+        None: no telemetry at its newest observations; the earlier comparison remains, since it is the same object.
         Evidence of flight in open air remains when the candidate comes near an object, unless telemetry contradicts it.
         """
         if log_ratios is None:

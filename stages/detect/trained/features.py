@@ -3,8 +3,8 @@
 `features_of` is a pure function of a candidate's history. A feature that is not available (no telemetry, too few
 observations for a speed) is NaN. VERSION changes with the list or the meaning of a feature.
 
-Each is monotone but the range: what has no sign by physics, as the climb or the age of a candidate, is specific to the
-flights of a simulator and misleads in other skies (docs/reference/detection.md).
+Each is monotone but the range: what has no sign by physics, as the climb or the age of a candidate, tells more of the
+flights of a simulator than of the candidate.
 
 Features depend on the classifier of the run, which decides which candidates are kept and counted. Train on replays with
 the classifier that the model replaces, then again on replays with the model.
@@ -64,8 +64,8 @@ FEATURES: tuple[Feature, ...] = (
     Feature("hardest_mps2", -1, "highest acceleration that it significantly had", "motion"),
     Feature("top_mps", -1, "speed that it reaches, with its turn", "motion"),
     Feature("calm_s", 1, "time in which it flew more calmly than a bird cruises", "motion"),
-    Feature("straight_mps", 1, "mean velocity since then", "motion"),
-    Feature("straight_sigmas", 1, "the same in its sigmas", "motion"),
+    Feature("straight_mps", 1, "mean speed along its path", "motion"),
+    Feature("straight_sigmas", 1, "mean speed along its path, in its sigmas", "motion"),
     Feature("moves", 1, "it moved over ground", "motion"),
     Feature("near_rejected", -1, "a rejected object near it", "surroundings"),
     Feature("revisited", -1, "a rejected object at its position", "surroundings"),

@@ -2,8 +2,9 @@
 
 Penalised maximum likelihood over the values at the knots, which are quantiles of the training data. The penalty pulls
 to the prior knowledge: log likelihood ratios of the telemetry count as they are, in part, since their observations err
-together; everything else counts nothing until the data show it. Its strength is chosen by the log loss on seeds that
-were left out, since the rows of one flight are not independent.
+together; everything else counts nothing until the data show it. Its strength is chosen by the log loss on flights that
+were left out, since the rows of one flight are not independent. No function of the range is fitted: it would be that
+of the ranges at which the training flights have drones.
 
 Source: grd; Wood, Generalized Additive Models (2017), 5.3 (penalised linear splines); SciPy's L-BFGS-B.
 """
@@ -23,8 +24,8 @@ from flow.link import LinkError
 from links.evaluation.errors import brier_and_log_loss
 from links.evaluation.stage_metrics import SCORE_RANGES_M
 from links.training.candidates import CandidateRows
-from stages.detect.trained.features import FEATURES, NAMES, RANGE, TELEMETRY, VERSION
-from stages.detect.trained.model import ALTERNATIVES, ANY, FAR, NEAR, At, DetectorModel, Term, farness
+from stages.detect.trained.features import FEATURES, NAMES, TELEMETRY, VERSION
+from stages.detect.trained.model import ALTERNATIVES, DetectorModel, Term
 from stages.geometry.frames import Array64
 from stages.geometry.lidar_models import LidarModel
 
@@ -38,28 +39,27 @@ LLR_SHARE = {
 }  # fmt: skip
 PRIOR_PENALTY = 0.02  # assumed; of the priors, relative to the other parameters
 STRENGTHS = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0)  # of the penalty
-FOLDS = 3
+FOLDS = 5
 EASY_SHARE = 0.05  # assumed; of the single observations without telemetry that are used; they are most of all rows
+OF_THE_OBJECT = (  # what tells a drone from another flier in open air
+    "return_ratio", "return_count_nats", "free_sectors", "least_free", "isolated_score", "neighbour_score", "top_mps",
+    "relative_speed_mps", "acceleration_mps2", "calm_s",
+)  # fmt: skip
 USED: tuple[tuple[str, ...], ...] = (  # features of each alternative
     (
-        "existence_nats", "false_per_s", "range_m", "scan_passes", "first_returns", "return_ratio", "passed_pulses",
+        "existence_nats", "false_per_s", "scan_passes", "first_returns", "return_ratio", "passed_pulses",
         "missed_returns", "neighbour_score",
     ),
     (
-        "range_m", "scan_passes", "return_count_nats", "free_sectors", "least_free", "neighbour_score",
-        "isolated_score", "large_object_m", "large_object_share", "too_long_passes", "straight_sigmas", "moves",
-        "near_rejected", "revisited", "displaced_nats", "passes_since_reacquired", "imu_over_static_nats",
+        "scan_passes", "return_count_nats", "free_sectors", "least_free", "neighbour_score", "isolated_score",
+        "large_object_m", "large_object_share", "too_long_passes", "straight_sigmas", "moves", "near_rejected",
+        "revisited", "displaced_nats", "passes_since_reacquired", "imu_over_static_nats",
     ),
+    (*OF_THE_OBJECT, "fastest_mps", "hardest_mps2", "over_bird_nats", "imu_over_bird_nats"),
     (
-        "range_m", "return_ratio", "top_mps", "relative_speed_mps", "acceleration_mps2", "fastest_mps", "hardest_mps2",
-        "calm_s", "over_bird_nats", "imu_over_bird_nats",
+        *OF_THE_OBJECT, "round_chords", "rough_chords", "straight_mps", "over_balloon_nats", "imu_over_balloon_nats",
     ),
-    ("range_m", "round_chords", "rough_chords", "straight_mps", "over_balloon_nats", "imu_over_balloon_nats"),
 )  # fmt: skip
-RANGED = {  # features whose weight depends on the range: their terms are near and far
-    "scan_passes", "first_returns", "return_ratio", "free_sectors", "neighbour_score", "isolated_score",
-    "displaced_nats",
-}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,6 @@ class _Column:
 
     alternative: int
     feature: str
-    at: At
     low: float  # of a prior: 1 with telemetry, 0 without
     high: float
     sign: int
@@ -99,15 +98,14 @@ def train(
     `start`: a model of other rows; the penalty pulls to its weights. `strengths`: of the penalty, to choose from (None:
     STRENGTHS).
     """
-    seeds = np.unique(rows.seed)
-    if min(rows.is_drone.sum(), (~rows.is_drone).sum()) < 100 or len(seeds) < 2:
+    if min(rows.is_drone.sum(), (~rows.is_drone).sum()) < 100 or len(np.unique(rows.seed)) < 2:
         raise LinkError("training needs at least 100 rows of drones, 100 of others, and two seeds")
     easy = ~rows.is_drone & ~rows.with_telemetry & (rows.feature("scan_passes") <= 1)
     kept = ~easy | (np.random.default_rng(0).uniform(size=len(easy)) < EASY_SHARE)
     weight = np.where(easy, 1.0 / EASY_SHARE, 1.0)[kept]
     columns = _columns(rows.take(kept), left_out, start)
     A, y = _design(rows.X[kept], columns), rows.is_drone[kept]
-    fold = np.searchsorted(seeds, rows.seed[kept]) % min(FOLDS, len(seeds))
+    fold = rows.run[kept] % FOLDS
     strengths = strengths or STRENGTHS
     several = strengths if len(strengths) > 1 else ()
     losses = {strength: _left_out_loss(A, y, weight, fold, columns, strength) for strength in several}
@@ -143,22 +141,21 @@ def _columns(rows: CandidateRows, left_out: Sequence[str], start: DetectorModel 
     rng, others = np.random.default_rng(0), np.nonzero(~rows.is_drone)[0]
     drones = np.nonzero(rows.is_drone)[0]
     some = np.concatenate([drones, rng.choice(others, min(3 * len(drones), len(others)), replace=False)])
-    before = {(t.alternative, t.feature, t.at): t for t in start.terms} if start is not None else {}
+    before = {(t.alternative, t.feature): t for t in start.terms} if start is not None else {}
     columns: list[_Column] = []
     for alternative, names in enumerate(USED):
         for with_telemetry in (0, 1):
             mean = 2.0 * with_telemetry if start is None else start.priors[alternative][with_telemetry]
-            columns.append(_Column(alternative, "", ANY, float(with_telemetry), float(with_telemetry), 0, mean))
+            columns.append(_Column(alternative, "", float(with_telemetry), float(with_telemetry), 0, mean))
         for name in names:
             if name in left_out:
                 continue
-            for at in (NEAR, FAR) if name in RANGED else (ANY,):
-                term = before.get((alternative, name, at))
-                columns += _of_term(term) if term is not None else _new_term(alternative, name, at, rows, some)
+            term = before.get((alternative, name))
+            columns += _of_term(term) if term is not None else _new_term(alternative, name, rows, some)
     return columns
 
 
-def _new_term(alternative: int, name: str, at: At, rows: CandidateRows, some: NDArray[np.int64]) -> list[_Column]:
+def _new_term(alternative: int, name: str, rows: CandidateRows, some: NDArray[np.int64]) -> list[_Column]:
     """The parameters of a feature, by its values in `some` rows; none where it is hardly ever known."""
     x, share = rows.feature(name)[some], LLR_SHARE.get(name, 0.0)
     known = x[~np.isnan(x)]
@@ -166,23 +163,23 @@ def _new_term(alternative: int, name: str, at: At, rows: CandidateRows, some: ND
         return []
     knots = np.array(LLR_KNOTS) if name in LLR_SHARE else np.unique(_rounded(np.quantile(known, _levels())))
     sign = FEATURES[NAMES.index(name)].monotone
-    ramps = [_Column(alternative, name, at, a, b, sign, share * (b - a)) for a, b in pairwise(knots.tolist())]
-    return ramps + _missing(alternative, name, at, 0.0)
+    ramps = [_Column(alternative, name, a, b, sign, share * (b - a)) for a, b in pairwise(knots.tolist())]
+    return ramps + _missing(alternative, name, 0.0)
 
 
 def _of_term(term: Term) -> list[_Column]:
     """The parameters of a term of the model to start from."""
     sign, name = FEATURES[NAMES.index(term.feature)].monotone, term.feature
     steps = zip(pairwise(term.knots), pairwise(term.values), strict=True)
-    ramps = [_Column(term.alternative, name, term.at, a, b, sign, after - value) for (a, b), (value, after) in steps]
-    return ramps + _missing(term.alternative, name, term.at, term.missing)
+    ramps = [_Column(term.alternative, name, a, b, sign, after - value) for (a, b), (value, after) in steps]
+    return ramps + _missing(term.alternative, name, term.missing)
 
 
-def _missing(alternative: int, name: str, at: At, mean: float) -> list[_Column]:
+def _missing(alternative: int, name: str, mean: float) -> list[_Column]:
     """The parameter of a missing feature; a log likelihood ratio that is missing is no evidence."""
     if name.endswith("_nats"):
         return []
-    return [_Column(alternative, name, at, np.nan, np.nan, 0, mean)]
+    return [_Column(alternative, name, np.nan, np.nan, 0, mean)]
 
 
 def _levels() -> Array64:
@@ -195,8 +192,7 @@ def _rounded(values: Array64) -> Array64:
 
 def _design(X: Array64, columns: Sequence[_Column]) -> list[NDArray[np.float32]]:
     """The design matrix (n, parameters) of each alternative. Ramps of ratios below 0 are -1 to 0: 0 is no evidence."""
-    with_telemetry, far = ~np.isnan(X[:, TELEMETRY]), farness(X[:, RANGE])
-    shares = {ANY: np.ones(len(X)), NEAR: 1.0 - far, FAR: far}
+    with_telemetry = ~np.isnan(X[:, TELEMETRY])
     found: list[NDArray[np.float32]] = []
     for alternative in range(len(ALTERNATIVES)):
         parts: list[Array64] = []
@@ -209,10 +205,10 @@ def _design(X: Array64, columns: Sequence[_Column]) -> list[NDArray[np.float32]]
             x = X[:, NAMES.index(c.feature)]
             missing = np.isnan(x)
             if np.isnan(c.low):
-                parts.append(missing * shares[c.at])
+                parts.append(missing.astype(np.float64))
             else:
                 ramp = np.clip((np.where(missing, 0.0, x) - c.low) / (c.high - c.low), 0.0, 1.0) - _start(c)
-                parts.append(np.where(missing, 0.0, ramp) * shares[c.at])
+                parts.append(np.where(missing, 0.0, ramp))
         found.append(np.column_stack(parts).astype(np.float32))
     return found
 
@@ -277,28 +273,27 @@ def _model(
     columns: Sequence[_Column], theta: Array64, trained: dict[str, Any], lidar_model: LidarModel
 ) -> DetectorModel:
     priors = np.zeros((len(ALTERNATIVES), 2))
-    ramps: dict[tuple[int, str, At], list[tuple[_Column, float]]] = {}
-    missing: dict[tuple[int, str, At], float] = {}
+    ramps: dict[tuple[int, str], list[tuple[_Column, float]]] = {}
+    missing: dict[tuple[int, str], float] = {}
     for c, value in zip(columns, theta.tolist(), strict=True):
         if not c.feature:
             priors[c.alternative, int(c.low)] = value
         elif np.isnan(c.low):
-            missing[c.alternative, c.feature, c.at] = value
+            missing[c.alternative, c.feature] = value
         else:
-            ramps.setdefault((c.alternative, c.feature, c.at), []).append((c, value))
+            ramps.setdefault((c.alternative, c.feature), []).append((c, value))
     terms: list[Term] = []
-    for (alternative, feature, at), parts in ramps.items():
+    for (alternative, feature), parts in ramps.items():
         values = np.cumsum([0.0, *(value for _, value in parts)]) - sum(_start(c) * value for c, value in parts)
-        if np.abs(values).max() < 5e-4 and abs(missing.get((alternative, feature, at), 0.0)) < 5e-4:
+        if np.abs(values).max() < 5e-4 and abs(missing.get((alternative, feature), 0.0)) < 5e-4:
             continue
         terms.append(
             Term(
                 alternative=alternative,
                 feature=feature,
-                at=at,
                 knots=(parts[0][0].low, *(c.high for c, _ in parts)),
                 values=tuple(round(value, 4) for value in values.tolist()),
-                missing=round(missing.get((alternative, feature, at), 0.0), 4),
+                missing=round(missing.get((alternative, feature), 0.0), 4),
             )
         )
     rounded = tuple((round(without, 4), round(with_, 4)) for without, with_ in priors.tolist())

@@ -3,8 +3,8 @@
 `features_of` is a pure function of a candidate's history. A feature that is not available (no telemetry, too few
 observations for a speed) is NaN. VERSION changes with the list or the meaning of a feature.
 
-Each is monotone but the range: what has no sign by physics, as the climb or the age of a candidate, tells more of the
-flights of a simulator than of the candidate.
+Each that a model uses is monotone: what has no sign by physics, as the range, climb or age of a candidate, tells more
+of the flights of a simulator than of the candidate. The range is logged only.
 
 Features depend on the classifier of the run, which decides which candidates are kept and counted. Train on replays with
 the classifier that the model replaces, then again on replays with the model.
@@ -31,7 +31,7 @@ NOT_DISPLACED_NATS = 3.0  # cap of the log ratio over a static object that may s
 
 
 class Feature(NamedTuple):
-    """A feature: `monotone` +1 or -1, whether it makes a drone more or less probable by physics; 0 for the range."""
+    """A feature: `monotone` +1 or -1, whether it makes a drone more or less probable by physics; 0 for the range, which no model uses."""
 
     name: str
     monotone: int
@@ -80,7 +80,6 @@ FEATURES: tuple[Feature, ...] = (
 )
 GROUPS = tuple(dict.fromkeys(feature.group for feature in FEATURES))
 NAMES = tuple(feature.name for feature in FEATURES)
-RANGE = NAMES.index("range_m")
 TELEMETRY = NAMES.index("over_static_nats")  # NaN: not compared with telemetry
 FREE_SPACE = tuple(
     NAMES.index(name) for name in ("free_sectors", "least_free", "neighbour_score", "isolated_score")

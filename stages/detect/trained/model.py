@@ -4,9 +4,7 @@
 
 o_k are the log-odds of a drone over alternative k: a false return, a static object, a bird, a balloon. Each g_kj is a
 piecewise linear function of one feature, given by its values at knots, constant beyond the first and the last one, and
-monotone where `features.py` says so. A missing feature (NaN) adds `missing`. A term `at` near or far counts by its
-share of the range: near to NEAR_M, far from FAR_M, linear between, since a wire or an insect returns pulses near the
-sensor only. A drone must be more probable than every alternative, so the evidence against one of them never replaces
+monotone where `features.py` says so. A missing feature (NaN) adds `missing`. A drone must be more probable than every alternative, so the evidence against one of them never replaces
 that against another.
 
 `grd train-detector` writes the file (links/training); its command, data and scores are in it.
@@ -19,7 +17,7 @@ from __future__ import annotations
 import math
 from functools import cached_property
 from itertools import pairwise
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,24 +25,14 @@ from pydantic import Field, model_validator
 
 from flow.stage import StrictModel
 from stages.detect.candidate import Alternative, Candidate
-from stages.detect.trained.features import FEATURES, NAMES, RANGE, TELEMETRY, VERSION
+from stages.detect.trained.features import FEATURES, NAMES, TELEMETRY, VERSION
 from stages.geometry.frames import Array64
 from stages.geometry.lidar_models import LidarModel
 from stages.kernels.detect.model import evaluate
 
 ALTERNATIVES = tuple(Alternative)
-NEAR_M, FAR_M = 12.0, 30.0  # of terms near and far
-At = Literal["any", "near", "far"]
-ANY: At = "any"
-NEAR: At = "near"
-FAR: At = "far"
 REASONS = 3  # contributions named for people
 LEAST_NATS = 0.1  # contributions below are not named
-
-
-def farness(range_m: Any) -> Any:
-    """Share of the terms far, 0 to 1; 1 less it is that of the terms near."""
-    return np.clip((range_m - NEAR_M) / (FAR_M - NEAR_M), 0.0, 1.0)
 
 
 class Prediction(NamedTuple):
@@ -60,7 +48,6 @@ class Term(StrictModel):
 
     alternative: int = Field(ge=0, lt=len(ALTERNATIVES))
     feature: str
-    at: At = "any"
     knots: tuple[float, ...] = Field(min_length=2)
     values: tuple[float, ...] = Field(min_length=2)  # [nats] at the knots
     missing: float = 0.0
@@ -96,11 +83,9 @@ class DetectorModel(StrictModel):
 
     @cached_property
     def _tables(self) -> tuple[NDArray[np.int64], Array64, Array64, Array64]:
-        """(alternative, feature, knots, `at`) (terms, 4); knots, values (terms, most); missing (terms,)."""
+        """(alternative, feature, knots) (terms, 3); knots, values (terms, most); missing (terms,)."""
         most = max(len(term.knots) for term in self.terms)
-        where = [
-            (t.alternative, NAMES.index(t.feature), len(t.knots), (ANY, NEAR, FAR).index(t.at)) for t in self.terms
-        ]
+        where = [(term.alternative, NAMES.index(term.feature), len(term.knots)) for term in self.terms]
         knots, values = (np.zeros((len(self.terms), most)) for _ in range(2))
         for row, term in enumerate(self.terms):
             knots[row, : len(term.knots)], values[row, : len(term.knots)] = term.knots, term.values
@@ -111,7 +96,7 @@ class DetectorModel(StrictModel):
         compared = not math.isnan(features[TELEMETRY])
         over = np.array([prior[compared] for prior in self.priors])
         contributions = np.zeros((len(ALTERNATIVES), len(NAMES)))
-        log_odds = evaluate(*self._tables, features, farness(features[RANGE]), over, contributions)
+        log_odds = evaluate(*self._tables, features, over, contributions)
         return Prediction(log_odds, int(np.argmin(over)), contributions[0])
 
     def classify(self, c: Candidate) -> Prediction:

@@ -21,15 +21,13 @@ def evaluate(
     values: Array64,
     missing: Array64,
     x: Array64,
-    far: float,
     over: Array64,
     contributions: Array64,
 ) -> float:
     """Log-odds of a drone for features x (n,); see `DetectorModel` for where, knots, values, missing.
 
-    far: `farness` of its range. Adds the terms to over (alternatives,), which holds the priors. Row 0 of contributions
-    (alternatives, n) becomes the contribution of each feature: its terms, each weighted by the probability of its
-    alternative among them.
+    Adds the terms to over (alternatives,), which holds the priors. Row 0 of contributions (alternatives, n) becomes the
+    contribution of each feature: its terms, each weighted by the probability of its alternative among them.
     """
     for row in range(where.shape[0]):
         alternative, feature, last = where[row, 0], where[row, 1], where[row, 2] - 1
@@ -46,8 +44,6 @@ def evaluate(
                 k += 1
             share = (value - knots[row, k - 1]) / (knots[row, k] - knots[row, k - 1])
             nats = values[row, k - 1] + share * (values[row, k] - values[row, k - 1])
-        if where[row, 3] > 0:
-            nats *= far if where[row, 3] == 2 else 1.0 - far
         over[alternative] += nats
         contributions[alternative, feature] += nats
     least = over.min()

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from stages.detect.candidate import Alternative
 from stages.detect.trained.features import NAMES, VERSION
-from stages.detect.trained.model import ALTERNATIVES, FAR_M, NEAR_M, DetectorModel, Prediction, reasons_of
+from stages.detect.trained.model import ALTERNATIVES, DetectorModel, Prediction, reasons_of
 
 RANGE, SPEED = NAMES.index("range_m"), NAMES.index("top_mps")
 FAR = {"alternative": 0, "feature": "range_m", "knots": (10.0, 20.0, 40.0), "values": (1.0, 0.0, -3.0)}
@@ -40,13 +40,6 @@ def test_a_missing_feature_adds_its_own_value():
     only = model(FAST, priors=[(99.0, 99.0), (99.0, 99.0), (0.0, 0.0), (99.0, 99.0)])
     assert log_odds(only) == pytest.approx(-1.0)
     assert log_odds(only, top_mps=5.0) == pytest.approx(-2.5)
-
-
-@pytest.mark.parametrize(("at", "expected"), [("near", (-5.0, -2.5, 0.0)), ("far", (0.0, -2.5, -5.0))])
-def test_a_term_near_or_far_counts_by_its_share_of_the_range(at, expected):
-    only = model(FAST | {"at": at}, priors=[(99.0, 99.0), (99.0, 99.0), (0.0, 0.0), (99.0, 99.0)])
-    ranges_m = (NEAR_M, (NEAR_M + FAR_M) / 2, FAR_M)
-    assert [log_odds(only, range_m=r, top_mps=10.0) for r in ranges_m] == pytest.approx(expected)
 
 
 def test_a_drone_must_be_more_probable_than_all_alternatives_together():

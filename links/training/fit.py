@@ -41,9 +41,8 @@ PRIOR_PENALTY = 0.02  # assumed; of the priors, relative to the other parameters
 STRENGTHS = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0)  # of the penalty
 FOLDS = 5
 EASY_SHARE = 0.05  # assumed; of the single observations without telemetry that are used; they are most of all rows
-OF_THE_OBJECT = (  # what tells a drone from another flier in open air
-    "return_ratio", "return_count_nats", "free_sectors", "least_free", "isolated_score", "neighbour_score", "top_mps",
-    "relative_speed_mps", "acceleration_mps2", "calm_s",
+OF_FLIERS = (  # of size and open air around it: against a bird or balloon, too
+    "return_ratio", "return_count_nats", "free_sectors", "least_free", "isolated_score", "neighbour_score",
 )  # fmt: skip
 USED: tuple[tuple[str, ...], ...] = (  # features of each alternative
     (
@@ -55,10 +54,11 @@ USED: tuple[tuple[str, ...], ...] = (  # features of each alternative
         "large_object_m", "large_object_share", "too_long_passes", "straight_sigmas", "moves", "near_rejected",
         "revisited", "displaced_nats", "passes_since_reacquired", "imu_over_static_nats",
     ),
-    (*OF_THE_OBJECT, "fastest_mps", "hardest_mps2", "over_bird_nats", "imu_over_bird_nats"),
     (
-        *OF_THE_OBJECT, "round_chords", "rough_chords", "straight_mps", "over_balloon_nats", "imu_over_balloon_nats",
+        *OF_FLIERS, "top_mps", "relative_speed_mps", "acceleration_mps2", "fastest_mps", "hardest_mps2", "calm_s",
+        "over_bird_nats", "imu_over_bird_nats",
     ),
+    (*OF_FLIERS, "round_chords", "rough_chords", "straight_mps", "over_balloon_nats", "imu_over_balloon_nats"),
 )  # fmt: skip
 
 

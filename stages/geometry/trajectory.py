@@ -14,6 +14,7 @@ Source: DESIGN, sweep "ego-motion compensated"; ours.
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_right
 from collections import deque
 
@@ -102,7 +103,7 @@ class VehicleTrajectory:
         newest_ns, oldest_ns = self._poses[-1][0], max(self._poses[0][0], self._frame_start_ns)
         speed_known = newest_ns - oldest_ns >= TOGETHER_NS
         expected, seconds = self.constant_velocity(motion.stamp_ns), (motion.stamp_ns - newest_ns) * 1e-9
-        speed_mps = float(np.linalg.norm(self._newest_rates()[1])) if speed_known else None
+        speed_mps = math.hypot(*self._newest_rates()[1].tolist()) if speed_known else None
         return is_reachable(expected, self._in_map(motion), seconds, speed_mps)
 
     def _in_map(self, motion: VehicleMotion) -> tuple[Array64, Array64]:

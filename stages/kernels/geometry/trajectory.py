@@ -5,12 +5,14 @@ Source: see `stages/geometry/trajectory.py`.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 from stages.geometry.frames import Array64
 from stages.kernels.compiled import compiled
-from stages.kernels.geometry.so3 import exp_rotation, nearly_rotation
+from stages.kernels.geometry.so3 import exp_rotation, log_rotation, nearly_rotation
 
 STEP_NS = 50_000_000  # interval over which a velocity is computed
 
@@ -53,6 +55,14 @@ def poses_at(
         R_at[i] = nearly_rotation(R[after - 1] + share * (R[after] - R[after - 1]))
         t_at[i] = t[after - 1] + share * (t[after] - t[after - 1])
     return R_at, t_at
+
+
+@compiled
+def apart(R: Array64, t: Array64, R_other: Array64, t_other: Array64) -> tuple[float, float]:
+    """Distance [m] and angle [rad] between two poses R (3, 3), t (3,)."""
+    x, y, z = t_other[0] - t[0], t_other[1] - t[1], t_other[2] - t[2]
+    turn = log_rotation(R.T @ R_other)
+    return math.sqrt(x * x + y * y + z * z), math.sqrt(turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2)
 
 
 @compiled

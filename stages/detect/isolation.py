@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from stages.geometry.frames import Array64
 from stages.kernels.detect.isolation import MAP_SIZE, mark_cells, nearest_marked
-from stages.kernels.detect.pulse_buffer import count_sectors_all, keep_slice
+from stages.kernels.detect.pulse_buffer import keep_slice
 from stages.messages import SweptPulses
 
 MAX_SLICES = 16
@@ -56,12 +56,6 @@ class RecentPulses:
     def arrays(self) -> tuple[NDArray[np.float32], NDArray[np.float32], Array64, Array64, NDArray[np.int64]]:
         """Directions, ranges, origins, cones and sizes of the slices, as `count_sectors_all` takes them."""
         return self._direction, self._range_m, self._origin_m, self._fan, self._sizes
-
-    def isolation(
-        self, centre_m: Array64, disc_m: float, inner_m: float, close_m: float, outer_m: float, depth_m: float
-    ) -> Array64:
-        """Sector counts (TALLY,) around a position (3,) in the vehicle frame; see `count_sectors`."""
-        return count_sectors_all(*self.arrays, centre_m, disc_m, inner_m, close_m, outer_m, depth_m)
 
 
 class LargeObjectMap:

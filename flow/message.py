@@ -15,6 +15,7 @@ import re
 import struct
 import types
 from collections.abc import Callable
+from operator import attrgetter
 from typing import (
     Annotated,
     Any,
@@ -175,6 +176,7 @@ class Hasher(Protocol):
 _pack_float = struct.Struct("<d").pack
 _array_headers: dict[tuple[np.dtype[Any], tuple[int, ...]], bytes] = {}  # few types and shapes, hashed often
 MAX_ARRAY_HEADERS = 4096
+SMALL_BYTES = 2048  # copying a smaller array takes less time than a view of it
 
 
 def _array_header(array: NDArray[Any]) -> bytes:
@@ -198,8 +200,8 @@ class _Parts:
         self.texts: list[bytes] = []
 
 
-def hash_into(values: Hasher, texts: Hasher, value: Any) -> None:
-    """Feed a message's values, to the last bit and with their types, into one hash, and its texts into another.
+def hash_into(values: Hasher, texts: Hasher, value: Any, before: bytes = b"") -> None:
+    """Feed `before` and a message's values into one hash, to the last bit and with types, and its texts into another.
 
     Names of classes, fields and enum members are not hashed: a message type counts by its `schema`, a field by its
     position, an enum member by its value. TypeError for a type that a message may not hold.
@@ -207,6 +209,7 @@ def hash_into(values: Hasher, texts: Hasher, value: Any) -> None:
     Each hash is updated once: hashlib releases Python's lock for each buffer beyond 2 kB, and has to wait for it again.
     """
     parts = _Parts()
+    parts.values.append(before)
     _add(parts, value)
     values.update(b"".join(parts.values))
     if parts.texts:
@@ -236,19 +239,36 @@ def _adder_of(value: Any, cls: type[Any]) -> Adder:
 
 def _fields_adder(cls: type[Any]) -> Adder:
     header, names = b"{" + getattr(cls, "schema", "").encode(), [field.name for field in dataclasses.fields(cls)]
+    values_of: Callable[[Any], tuple[Any, ...]] = (
+        attrgetter(*names) if len(names) > 1 else lambda value: tuple(getattr(value, name) for name in names)
+    )
 
     def add(parts: _Parts, value: Any) -> None:
         parts.values.append(header)
-        for name in names:
-            _add(parts, getattr(value, name))
+        _add_each(parts, values_of(value))
         parts.values.append(b"}")
 
     return add
 
 
+def _add_each(parts: _Parts, items: tuple[Any, ...]) -> None:
+    """Write values one after another; the most frequent types without a call for each."""
+    append, adders = parts.values.append, _adders
+    for item in items:
+        cls: Any = item.__class__
+        if cls is float:
+            append(b"d" + _pack_float(item))
+        elif cls is int:
+            append(b"i%d;" % item)
+        else:
+            (adders.get(cls) or _adder_of(item, cls))(parts, item)
+
+
 def _add_array(parts: _Parts, array: NDArray[Any]) -> None:
     parts.values.append(_array_header(array))
-    if array.size:
+    if array.nbytes < SMALL_BYTES:
+        parts.values.append(array.tobytes())
+    else:
         parts.values.append(array.data if array.flags.c_contiguous else np.ascontiguousarray(array).data)
 
 
@@ -264,8 +284,7 @@ def _add_text(parts: _Parts, text: str) -> None:
 
 def _add_tuple(parts: _Parts, items: tuple[Any, ...]) -> None:
     parts.values.append(b"(%d:" % len(items))
-    for item in items:
-        _add(parts, item)
+    _add_each(parts, items)
 
 
 _KINDS: tuple[tuple[Any, Adder], ...] = (

@@ -6,12 +6,13 @@ Source: ours; bins grow by 2^(1/8), so a percentile is within 9 % of the true on
 from __future__ import annotations
 
 from array import array
-from math import log2
+from bisect import bisect_right
 
 import numpy as np
 
 BINS_PER_OCTAVE = 8
 _BINS = 40 * BINS_PER_OCTAVE  # 1 ns .. 1000 s
+_UPPER_EDGES_NS = [2 ** (edge / BINS_PER_OCTAVE) for edge in range(1, _BINS)]  # the last bin has none
 
 
 class Latency:
@@ -29,7 +30,7 @@ class Latency:
         self.total_ns += duration_ns
         if duration_ns > self.max_ns:
             self.max_ns = duration_ns
-        self._bins[min(int(BINS_PER_OCTAVE * log2(duration_ns)), _BINS - 1) if duration_ns > 1 else 0] += 1
+        self._bins[bisect_right(_UPPER_EDGES_NS, duration_ns)] += 1
 
     def percentile_ns(self, percent: float) -> float:
         """Upper edge of the bin that holds the percentile, at most the maximum; 0 without data."""

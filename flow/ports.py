@@ -35,18 +35,16 @@ class Output(Generic[F]):
         self.count, self.checked = 0, False
 
 
-def messages_of(handler: Callable[[Any], Any], message: Any) -> tuple[Message, ...]:
-    """What a handler gives for one message: none, one, or several."""
-    result = handler(message)
-    if result is None:
-        return ()
-    return (result,) if isinstance(result, Message) else tuple(result)  # a generator does its work here
-
-
 def call(name: str, handler: Callable[[Any], Any], message: Any, arrival_ns: int) -> tuple[Message, ...]:
-    """What a handler gives for one message. RunError: what it raised; a link's LinkError is raised as it is."""
+    """What a handler gives for one message: none, one, or several messages.
+
+    RunError: what it raised; a link's LinkError is raised as it is.
+    """
     try:
-        return messages_of(handler, message)
+        result = handler(message)
+        if result is None:
+            return ()
+        return (result,) if isinstance(result, Message) else tuple(result)  # a generator does its work here
     except (LinkError, RunError):
         raise  # its text is complete
     except Exception as error:

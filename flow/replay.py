@@ -180,8 +180,8 @@ class Replay:
             arrival_ns, _, _, _, port, message = heappop(heap)
             if port is None:
                 self._publish_remote(message, arrival_ns)
-            else:
-                self._publish_all(port, arrival_ns, self._step(port, arrival_ns, message))
+            elif given := self._step(port, arrival_ns, message):
+                self._publish_all(port, arrival_ns, given)
 
     def _push_remote(self, outputs: RemoteOutputs, arrival_ns: int) -> None:
         """Put the outputs of remote nodes into the heap."""

@@ -37,8 +37,7 @@ class Digest(Tap):
             )  # twice as fast as blake2b where the CPU has instructions for it
             known = self._hashes[output] = (type(message).schema, *hashers)
         _, values, texts = known
-        values.update(b"@%d" % arrival_ns)
-        hash_into(values, texts, message)
+        hash_into(values, texts, message, b"@%d" % arrival_ns)
 
     @property
     def outputs(self) -> dict[str, str]:

@@ -111,6 +111,11 @@ class CueEvidence:
         self._weights, self._search_m = weights, search_m
         self._cues: dict[str, _Cue] = {}
 
+    @property
+    def known(self) -> bool:
+        """Whether there was any cue."""
+        return bool(self._cues)
+
     def add(self, cue: DroneCue, trail: VehicleTrajectory, drones: list[ObjectState]) -> CueState:
         """Add a measurement; `drones` are those that the LiDAR alone would accept, seen at most 0.5 s ago."""
         known = self._cues.get(cue.source)

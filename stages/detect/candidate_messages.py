@@ -15,6 +15,7 @@ from stages.detect.candidate import Candidate
 from stages.detect.trained.features import NAMES
 from stages.geometry.frames import Array64
 from stages.geometry.trajectory import VehicleTrajectory
+from stages.kernels.geometry.trajectory import positions_in_vehicle
 from stages.messages import CandidateEvidence, CandidateLog, Candidates, Detections
 
 
@@ -23,12 +24,13 @@ def candidate_log(
 ) -> CandidateLog:
     """The classified candidates of a slice, each at its last observation."""
     listed = list(classified)
-    positions_m = [trail.to_vehicle(c.seen_ns, c.path_m[-1], c.velocity_mps)[0] for c in listed]
+    seen_ns = np.array([c.seen_ns for c in listed], dtype=np.int64)
+    xyz_map_m = np.array([c.path_m[-1] for c in listed]).reshape(-1, 3)
     return CandidateLog(
         stamp_ns=now_ns,
         candidate_id=np.array([c.number for c in listed], dtype=np.int64),
-        seen_ns=np.array([c.seen_ns for c in listed], dtype=np.int64),
-        xyz_vehicle_m=np.array(positions_m).reshape(-1, 3),
+        seen_ns=seen_ns,
+        xyz_vehicle_m=positions_in_vehicle(*trail.at_each(seen_ns), xyz_map_m),
         probability=np.array([probability(c.log_odds) for c in listed], dtype=np.float64),
         features=np.array([c.features for c in listed]),
         feature_names=NAMES,

@@ -66,6 +66,8 @@ class CandidateTable:
     def best_fit(self, s: Observation, reacquired: bool = False) -> Candidate | None:
         """The most probable candidate for an observation, of the reacquired or of the others; None: none fits."""
         rows = len(self._candidates)
+        if not rows:
+            return None
         row = nearest_row(self._state, self._ns, self._reacquired, rows, reacquired, s.stamp_ns, s.xyz_map_m)
         return self._candidates[row] if row >= 0 else None
 

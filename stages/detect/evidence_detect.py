@@ -155,6 +155,8 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
         finder = ObservationFinder(limits, settings.unit.profile)
         travel = Travel(math.radians(settings.sweep_deg - 3.0), math.radians(0.5))
         self._now = _State(finder, travel, CueEvidence(settings.cues, settings.furthest_m))
+        self._accept_nats = log_odds_of(settings.accept_probability)
+        self._follow_up_nats = log_odds_of(settings.follow_up_probability)
 
     def on_motion(self, motion: VehicleMotion) -> None:
         """Update the vehicle's trajectory. Without it only vertical motion counts, unless `parked` is set."""
@@ -174,13 +176,13 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
 
     def on_cue(self, cue: DroneCue) -> CueState:
         """Add a measurement of another sensor, and compare it with the drones that the LiDAR alone would accept."""
-        now, accept = self._now, log_odds_of(self.settings.accept_probability)
+        now = self._now
         drones = [
             _object(c)
             for c in now.table
             if c.scan_passes >= COMPARED_PASSES
             and abs(cue.stamp_ns - c.seen_ns) < COMPARED_NS
-            and c.own_log_odds >= accept
+            and c.own_log_odds >= self._accept_nats
         ]
         return now.cues.add(cue, now.trail, drones)
 
@@ -260,7 +262,7 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
 
     def _reacquire(self, now: _State, s: Observation) -> None:
         """Continue a candidate at an observation at which the drone's odometry predicts it after a pause."""
-        if not self._motion_known(s.stamp_ns) or not now.telemetry.moves(s.stamp_ns):
+        if not len(now.table) or not self._motion_known(s.stamp_ns) or not now.telemetry.moves(s.stamp_ns):
             return
         if match := now.telemetry.reacquire(now.table, s):
             now.number += 1
@@ -298,9 +300,9 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
         c.own_log_odds = c.log_odds
         remark = self._add_cues(now, c)
         now.classified[c.number] = c
-        accept = log_odds_of(settings.accept_probability)
+        accept = self._accept_nats
         c.accepted = c.log_odds >= accept or (c.accepted and c.own_log_odds >= accept - HYSTERESIS_NATS)
-        before, c.is_promising = c.is_promising, c.log_odds >= log_odds_of(settings.follow_up_probability)
+        before, c.is_promising = c.is_promising, c.log_odds >= self._follow_up_nats
         c.was_promising |= c.is_promising
         if prediction is not None and (c.is_promising or c.observations > 1):  # others are rejected at once
             c.reason = reasons_of(c.features, prediction)
@@ -314,6 +316,9 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
         that are not proven to be of this candidate ends below the threshold of acceptance. Returns the remark for
         people.
         """
+        if not now.cues.known:
+            c.cue_nats = None
+            return ""
         state = _object(c)
         nats, of_proven, remark = now.cues.nats(state, now.trail, c.stamp_ns, c.proven_cues)
         if not remark:
@@ -325,12 +330,12 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
             since_s = (c.stamp_ns - c.cue_ns) * 1e-9
             nats = min(nats, c.cue_nats + self.settings.cues.recovery_nats_per_s * since_s)
         c.cue_nats, c.cue_ns = nats, c.stamp_ns
-        ceiling = max(log_odds_of(self.settings.accept_probability) - CUE_MARGIN_NATS - c.log_odds, 0.0)
+        ceiling = max(self._accept_nats - CUE_MARGIN_NATS - c.log_odds, 0.0)
         if nats > max(of_proven, ceiling) and c.scan_passes >= CUE_PASSES:
             c.proven_cues |= now.cues.proven(ObjectPath(c.path_ns, c.path_m, scatter_m(c.range_m)), now.trail)
             of_proven = now.cues.nats(state, now.trail, c.stamp_ns, c.proven_cues).of_proven
         nats = min(nats, max(of_proven, ceiling) if c.scan_passes >= CUE_PASSES else ceiling)
-        observed = min(c.log_odds, log_odds_of(self.settings.follow_up_probability))
+        observed = min(c.log_odds, self._follow_up_nats)
         c.log_odds = max(c.log_odds + nats, observed)  # a wrong cue does not end the observation of the drone
         return f"; cues {nats:+.1f} ({remark})"
 

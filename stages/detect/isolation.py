@@ -16,10 +16,11 @@ Source: ours; DESIGN, "a small cluster with *measured* emptiness around it".
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stages.geometry.frames import Array64
 from stages.kernels.detect.isolation import MAP_SIZE, mark_cells, nearest_marked
-from stages.kernels.detect.pulse_buffer import count_sectors_all, keep_slice
+from stages.kernels.detect.pulse_buffer import keep_slice
 from stages.messages import SweptPulses
 
 MAX_SLICES = 16
@@ -51,14 +52,10 @@ class RecentPulses:
         )  # fmt: skip
         self._next = (k + 1) % MAX_SLICES
 
-    def isolation(
-        self, centre_m: Array64, disc_m: float, inner_m: float, close_m: float, outer_m: float, depth_m: float
-    ) -> Array64:
-        """Sector counts (TALLY,) around a position (3,) in the vehicle frame; see `count_sectors`."""
-        return count_sectors_all(
-            self._direction, self._range_m, self._origin_m, self._fan, self._sizes,
-            centre_m, disc_m, inner_m, close_m, outer_m, depth_m,
-        )  # fmt: skip
+    @property
+    def arrays(self) -> tuple[NDArray[np.float32], NDArray[np.float32], Array64, Array64, NDArray[np.int64]]:
+        """Directions, ranges, origins, cones and sizes of the slices, as `count_sectors_all` takes them."""
+        return self._direction, self._range_m, self._origin_m, self._fan, self._sizes
 
 
 class LargeObjectMap:
@@ -68,6 +65,11 @@ class LargeObjectMap:
         self._cell_m = cell_m
         self._key = np.zeros(MAP_SIZE, dtype=np.int64)
         self._when = np.zeros(MAP_SIZE, dtype=np.int64)
+
+    @property
+    def arrays(self) -> tuple[float, NDArray[np.int64], NDArray[np.int64]]:
+        """Size of a cell, keys and times of the cells, as `nearest_marked` takes them."""
+        return self._cell_m, self._key, self._when
 
     def add(self, points_m: Array64, stamp_ns: int) -> None:
         """Add points (n, 3) of large objects, in a static frame."""

@@ -7,7 +7,6 @@ Source: ours; DESIGN, The graph: detect.
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from typing import NamedTuple
 
@@ -19,7 +18,16 @@ from stages.detect.isolation import LargeObjectMap, RecentPulses
 from stages.geometry.frames import Array64
 from stages.geometry.lidar_models import LidarProfile
 from stages.geometry.trajectory import VehicleTrajectory
-from stages.kernels.detect.observations import BIG, SMALL, kinds_of, merge_chords, positions_of_kind, round_and_rough
+from stages.kernels.detect.observations import (
+    BIG,
+    RANGE,
+    SMALL,
+    TALLY_0,
+    group_chords,
+    kinds_of,
+    observe,
+    positions_of_kind,
+)
 from stages.kernels.sweep.pulses import HOLE, LONGEST, STEP
 from stages.messages import SweptPulses
 
@@ -52,7 +60,6 @@ class _Chord(NamedTuple):
     stamp_ns: int  # middle
     last_ns: int  # last return
     row: Array64
-    middle_m: tuple[float, ...]  # its middle
 
 
 class ObservationFinder:
@@ -76,14 +83,7 @@ class ObservationFinder:
             return []
         ready = sorted((c for c in self._waiting if now_ns - c.last_ns >= DELAY_NS), key=lambda c: c.stamp_ns)
         self._waiting = [c for c in self._waiting if now_ns - c.last_ns < DELAY_NS]
-        found: list[Observation] = []
-        while ready:
-            first = ready[0].middle_m
-            near = [math.dist(c.middle_m, first) <= 1.2 * self._limits.span_m for c in ready]
-            same = [c for c, is_near in zip(ready, near, strict=True) if is_near]
-            found.append(self._observation(same, trail, motion_known))
-            ready = [c for c, is_near in zip(ready, near, strict=True) if not is_near]
-        return found
+        return self._observations(ready, trail, motion_known) if ready else []
 
     def _find(self, slice_: Slice) -> None:
         limits, pulses = self._limits, slice_.pulses
@@ -100,31 +100,37 @@ class ObservationFinder:
         if small:
             for i in np.nonzero(kinds == SMALL)[0].tolist():
                 first_ns, last_ns = int(found.first_ns[i]), int(found.last_ns[i])
-                self._waiting.append(_Chord((first_ns + last_ns) // 2, last_ns, rows[i], tuple(rows[i, :3].tolist())))
+                self._waiting.append(_Chord((first_ns + last_ns) // 2, last_ns, rows[i]))
 
-    def _observation(self, same: list[_Chord], trail: VehicleTrajectory, motion_known: bool) -> Observation:
-        span_m = self._limits.span_m
-        rows, stamp_ns = np.array([c.row for c in same]), same[0].stamp_ns
-        R, t = trail.at(stamp_ns)
-        middle, xyz_map_m, returns, range_m, extent_m = merge_chords(rows, R, t)
-        round_chords, rough = round_and_rough(rows)
-        since_ns = stamp_ns - (MEMORY_NS if motion_known else SHORT_MEMORY_NS)
-        return Observation(
-            stamp_ns=stamp_ns,
-            xyz_map_m=xyz_map_m,
-            vehicle_map_m=t,
-            range_m=range_m,
-            returns=returns,
-            too_long=extent_m > 1.3 * span_m,
-            round_chords=round_chords,
-            rough_chords=rough,
-            isolation=self._isolation(middle, range_m),
-            large_object_m=self._large.nearest_m(xyz_map_m, 1.1 * span_m, self._limits.clear_m, since_ns),
-        )
-
-    def _isolation(self, middle_m: Array64, range_m: float) -> Array64:
-        """Sector counts (TALLY,) of the last slices around a position in the vehicle frame."""
-        span_m = self._limits.span_m
-        close_m = max(2.4 * span_m, 1.15 * self._beam_spacing_rad * range_m)  # at least two beam spacings wide
-        outer_m = max(self._limits.clear_m, 1.5 * self._beam_spacing_rad * range_m)
-        return self._recent.isolation(middle_m, 0.3 * span_m, 1.1 * span_m, close_m, outer_m, 0.5)
+    def _observations(self, chords: list[_Chord], trail: VehicleTrajectory, motion_known: bool) -> list[Observation]:
+        """The observations of chords in order of time, one of each object."""
+        limits, rows = self._limits, np.array([c.row for c in chords])
+        groups = np.empty(len(rows), dtype=np.int64)
+        count = group_chords(rows, 1.2 * limits.span_m, groups)
+        numbers = groups.tolist()
+        stamps_ns = [chords[numbers.index(k)].stamp_ns for k in range(count)]
+        stamps = np.array(stamps_ns, dtype=np.int64)
+        R, t = trail.at_each(stamps)
+        since_ns = stamps - (MEMORY_NS if motion_known else SHORT_MEMORY_NS)
+        found = observe(
+            rows, groups, R, t, since_ns, limits.span_m, limits.clear_m, self._beam_spacing_rad,
+            *self._recent.arrays, *self._large.arrays,
+        )  # fmt: skip
+        positions_m, sectors = found[:, :3], found[:, TALLY_0:]
+        return [
+            Observation(
+                stamp_ns=stamp_ns,
+                xyz_map_m=positions_m[k],
+                vehicle_map_m=t[k],
+                range_m=range_m,
+                returns=int(returns),
+                too_long=bool(too_long),
+                round_chords=int(round_chords),
+                rough_chords=int(rough),
+                isolation=sectors[k],
+                large_object_m=large_object_m,
+            )
+            for k, (stamp_ns, (range_m, large_object_m, returns, too_long, round_chords, rough)) in enumerate(
+                zip(stamps_ns, found[:, RANGE:TALLY_0].tolist(), strict=True)
+            )
+        ]

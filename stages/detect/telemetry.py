@@ -58,6 +58,8 @@ class DetectorTelemetry:
         For a reacquired candidate, the path since then counts alone where it contradicts the odometry: two objects may
         match the displacement by chance, while the second one moves differently.
         """
+        if len(c.path_ns) < 2:
+            return None
         log_ratios = self._of(c, 0, motion_known)
         if log_ratios is None or not c.reacquired_at or c.scan_passes - c.reacquired_at < MIN_PASSES_SINCE:
             return log_ratios
@@ -80,7 +82,7 @@ class DetectorTelemetry:
 
     def moves(self, stamp_ns: int) -> bool:
         """Whether the drone reports that it flies: then it is not a static object seen before."""
-        speeds = [telemetry.speed_mps(stamp_ns) for telemetry in self._both]
+        speeds = (telemetry.speed_mps(stamp_ns) for telemetry in self._both)
         return any(speed is not None and math.hypot(*speed) > MOVES_MPS for speed in speeds)
 
     def expected_motion(self, trail: VehicleTrajectory, now_ns: int) -> tuple[Array64, float, float]:

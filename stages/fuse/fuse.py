@@ -163,22 +163,23 @@ class Fuse(Stage[FuseSettings]):
 
     def on_servo(self, servo: ServoState) -> Poses:
         """Clock of a replay without other messages."""
-        yield from self._publish(servo)
+        return self._publish(servo)
 
     def on_tick(self, tick: Tick) -> Poses:
         """The host's clock."""
-        yield from self._publish(tick)
+        return self._publish(tick)
 
     # output
 
     def _publish(self, message: Message) -> Poses:
-        """Advance to the stamp of a message; yield a pose when that passes a point of the grid."""
+        """Advance to the stamp of a message; a pose when that passes a point of the grid."""
         now_ns = self._intake.pass_time(message.stamp_ns)
-        if now_ns is None:
-            return
-        at_ns = now_ns // GRID_NS * GRID_NS
-        if at_ns <= self._published_ns:
-            return
+        if now_ns is None or now_ns // GRID_NS * GRID_NS <= self._published_ns:
+            return iter(())
+        return self._poses_at(now_ns, now_ns // GRID_NS * GRID_NS)
+
+    def _poses_at(self, now_ns: int, at_ns: int) -> Poses:
+        """The outputs at a point of the grid."""
         fixed = self._map_frame.is_fixed(now_ns)
         if fixed != self._map_was_fixed:  # from now on the map frame moves with the vehicle, or stands
             self._estimator.start_map()

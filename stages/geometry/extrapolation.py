@@ -31,6 +31,7 @@ import numpy as np
 
 from stages.geometry.frames import Array64
 from stages.kernels.geometry.so3 import exp_rotation, log_rotation
+from stages.kernels.geometry.trajectory import apart
 from stages.messages import VehicleMotion
 
 EXTRAPOLATION_S = 0.3
@@ -123,9 +124,8 @@ def is_reachable(expected: Pose3, measured: Pose3, seconds: float, speed_mps: fl
         limit_m, limit_rad = limit_m + FASTEST_MPS * seconds, limit_rad + FASTEST_RADPS * seconds
     else:
         limit_m += LATE_S * speed_mps
-    (R, xyz_m), (R_measured, measured_m) = expected, measured
-    near = float(np.linalg.norm(measured_m - xyz_m)) <= limit_m
-    return near and float(np.linalg.norm(log_rotation(R.T @ R_measured))) <= limit_rad
+    distance_m, angle_rad = apart(*expected, *measured)
+    return distance_m <= limit_m and angle_rad <= limit_rad
 
 
 def _is_smooth(poses: tuple[VehicleMotion, ...]) -> bool:
@@ -170,7 +170,7 @@ def constant_turn_rate(poses: list[VehicleMotion], stamp_ns: int, until_s: float
 def speed_mps(poses: list[VehicleMotion]) -> float | None:
     """Mean speed over the last LEAST_SPAN_NS or more; None where the poses do not determine one."""
     span_ns, before = _speed_span(poses)
-    return float(np.linalg.norm(poses[-1].xyz_map_m - before.xyz_map_m)) / (span_ns * 1e-9) if span_ns else None
+    return math.dist(poses[-1].xyz_map_m, before.xyz_map_m) / (span_ns * 1e-9) if span_ns else None
 
 
 def _speed_span(poses: list[VehicleMotion]) -> tuple[int, VehicleMotion]:

@@ -14,18 +14,21 @@ Source: DESIGN, sweep "ego-motion compensated"; ours.
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_right
 from collections import deque
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stages.geometry.extrapolation import EXTRAPOLATION_S, LEAST_SPAN_NS, USUAL_MANEUVER, JumpGate, is_reachable
 from stages.geometry.frames import Array64
 from stages.kernels.geometry.so3 import log_rotation, nearest_rotation, nearly_rotation
-from stages.kernels.geometry.trajectory import STEP_NS, moved, to_map, to_vehicle
+from stages.kernels.geometry.trajectory import STEP_NS, moved, poses_at, to_map, to_vehicle
 from stages.messages import MotionStatus, VehicleMotion
 
 KEPT = 512  # poses
+NEWEST = 8  # poses between which `at_each` interpolates in one compiled call
 TOGETHER_NS = 10_000_000  # shortest interval that gives a speed
 RECENT_NS = 700_000_000  # the motion counts as known this long after a pose; visual odometry delivers 5 poses a second
 RESTART_NS = 2_000_000_000  # during a gap this long an odometry may restart unnoticed
@@ -41,6 +44,7 @@ class VehicleTrajectory:
         self._T_map_source: tuple[Array64, Array64] | None = None  # R, t; None: identity
         self._poses: deque[tuple[int, Array64, Array64]] = deque(maxlen=KEPT)  # stamp, R_map_vehicle, t_map_vehicle
         self._rates: tuple[Array64, Array64] | None = None  # cache of `_newest_rates`
+        self._newest: tuple[NDArray[np.int64], Array64, Array64] | None = None  # the NEWEST poses, for `at_each`
         self._frame_start_ns = 0  # earlier poses lie in another frame
         self._cache: dict[int, tuple[Array64, Array64]] = {}  # results of `at` since the newest pose
 
@@ -91,7 +95,7 @@ class VehicleTrajectory:
         """Remove the poses after a time, except the first."""
         while len(self._poses) > 1 and self._poses[-1][0] > after_ns:
             self._poses.pop()
-        self._gate, self._rates = JumpGate(), None
+        self._gate, self._rates, self._newest = JumpGate(), None, None
         self._cache.clear()
 
     def _is_reachable(self, motion: VehicleMotion) -> bool:
@@ -99,7 +103,7 @@ class VehicleTrajectory:
         newest_ns, oldest_ns = self._poses[-1][0], max(self._poses[0][0], self._frame_start_ns)
         speed_known = newest_ns - oldest_ns >= TOGETHER_NS
         expected, seconds = self.constant_velocity(motion.stamp_ns), (motion.stamp_ns - newest_ns) * 1e-9
-        speed_mps = float(np.linalg.norm(self._newest_rates()[1])) if speed_known else None
+        speed_mps = math.hypot(*self._newest_rates()[1].tolist()) if speed_known else None
         return is_reachable(expected, self._in_map(motion), seconds, speed_mps)
 
     def _in_map(self, motion: VehicleMotion) -> tuple[Array64, Array64]:
@@ -111,7 +115,7 @@ class VehicleTrajectory:
 
     def _append(self, motion: VehicleMotion) -> None:
         self._cache.clear()
-        self._rates = None
+        self._rates = self._newest = None
         R, t = self._in_map(motion)
         self._poses.append((motion.stamp_ns, np.ascontiguousarray(R), np.ascontiguousarray(t)))
 
@@ -145,6 +149,17 @@ class VehicleTrajectory:
         # The poses differ by milliseconds: interpolate linearly and project back to a rotation.
         self._cache[stamp_ns] = nearly_rotation(R0 + share * (R1 - R0)), x0 + share * (x1 - x0)
         return self._cache[stamp_ns]
+
+    def at_each(self, stamps_ns: NDArray[np.int64]) -> tuple[Array64, Array64]:
+        """R_map_vehicle (n, 3, 3) and t_map_vehicle (n, 3) [m] at times (n,), each as `at` gives them."""
+        if self._newest is None and len(self._poses) > 1:
+            poses = [self._poses[k] for k in range(-min(NEWEST, len(self._poses)), 0)]
+            ns, R, t = zip(*poses, strict=True)
+            self._newest = np.array(ns, dtype=np.int64), np.array(R), np.array(t)
+        if self._newest is not None and stamps_ns.size and stamps_ns.min() > self._newest[0][0]:
+            return poses_at(*self._newest, *self._newest_rates(), FURTHEST_NS, stamps_ns)
+        poses = [self.at(stamp_ns) for stamp_ns in stamps_ns.tolist()]
+        return np.array([R for R, _ in poses]).reshape(-1, 3, 3), np.array([t for _, t in poses]).reshape(-1, 3)
 
     def _beyond(self, seconds: float) -> tuple[Array64, Array64]:
         """R and t some seconds after the newest pose, with constant rates."""

@@ -83,7 +83,7 @@ class Sweep(Stage[SweepSettings]):
     def on_servo(self, servo: ServoState) -> Iterator[SweptPoints | SweptPulses | DepthImage]:
         """Add a servo state; yield the slices that waited for it."""
         self._turntable.add(servo)
-        yield from self._release()
+        return self._release() if self._waiting else iter(())
 
     def finish(self) -> Iterator[SweptPoints | SweptPulses | DepthImage]:
         """Yield the slices still queued, as far as their angle is known. An incomplete sweep gives no image."""

@@ -63,6 +63,19 @@ def digest(value):
     return digests(value)[0]
 
 
+def test_what_comes_before_a_message_is_hashed_as_its_own_update():
+    apart, together, texts = hashlib.blake2b(b"@7"), hashlib.blake2b(), hashlib.blake2b()
+    hash_into(apart, texts, cloud())
+    hash_into(together, texts, cloud(), b"@7")
+    assert together.hexdigest() == apart.hexdigest() != digest(cloud())
+
+
+def test_the_hash_of_a_large_array_is_that_of_its_bytes_in_any_memory_order():
+    for rows in (4, 4096):  # copied, and as a view
+        points = np.arange(3.0 * rows).reshape(rows, 3)
+        assert digest(points) == digest(np.asfortranarray(points)) != digest(-points)
+
+
 def test_an_output_is_named_after_its_message():
     names = {"DroneFix": "drone_fix", "LidarFirings": "lidar_firings", "VPRotation": "vp_rotation"}
     assert {n: port_name(type(n, (Message,), {})) for n in names} == names

@@ -18,6 +18,7 @@ from collections import deque
 import numpy as np
 
 from stages.geometry.frames import Array64
+from stages.kernels.odometry.outliers import is_outlier
 
 SAMPLES, DISTANCES = 5, 25
 FACTOR = 8.0
@@ -28,22 +29,23 @@ class FalseSamples:
     """The last samples, false ones included."""
 
     def __init__(self) -> None:
-        self._samples: deque[tuple[int, Array64]] = deque(maxlen=SAMPLES)
-        self._distances: deque[Array64] = deque(maxlen=DISTANCES)
+        self._stamps_ns: deque[int] = deque(maxlen=SAMPLES)
+        self._samples = np.zeros((SAMPLES, 2, 3))  # oldest first
+        self._distances = np.zeros((DISTANCES, 2))
+        self._measured = 0  # distances so far
 
     def new_segment(self) -> None:
         """Forget the samples, not the noise."""
-        self._samples.clear()
+        self._stamps_ns.clear()
 
     def add(self, stamp_ns: int, force: Array64, rate: Array64) -> bool:
         """Add a sample, (3,) each. True: it is false; never before the noise is known."""
-        self._samples.append((stamp_ns, np.stack((force, rate))))
-        if len(self._samples) < SAMPLES:
+        self._stamps_ns.append(stamp_ns)
+        samples = self._samples
+        samples[:-1] = samples[1:]
+        samples[-1, 0], samples[-1, 1] = force, rate
+        if len(self._stamps_ns) < SAMPLES:
             return False
-        last = [sample for _, sample in self._samples]
-        distance = np.linalg.norm(last[-1] - np.median(last, axis=0), axis=1)
-        self._distances.append(distance)
-        if len(self._distances) < DISTANCES:
-            return False
-        since_s = (stamp_ns - self._samples[SAMPLES // 2][0]) * 1e-9
-        return bool(np.any(distance > FACTOR * np.median(self._distances, axis=0) + CHANGE * since_s))
+        row, self._measured = self._measured % DISTANCES, self._measured + 1
+        since_s = (stamp_ns - self._stamps_ns[SAMPLES // 2]) * 1e-9
+        return is_outlier(samples, self._distances, row, self._measured >= DISTANCES, FACTOR, CHANGE * since_s)

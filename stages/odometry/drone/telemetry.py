@@ -9,8 +9,6 @@ import math
 from bisect import bisect_left
 from collections import deque
 
-import numpy as np
-
 from stages.geometry.frames import Array64
 from stages.messages import DroneLocalPosition, DroneOdometry
 
@@ -40,9 +38,10 @@ class DroneTelemetry:
             dt = (stamp_ns - self._ns[-1]) * 1e-9
             if dt <= 0:
                 return
-            left = xyz_m - self._xyz_m[-1] - 0.5 * dt * (v_mps + self._v_mps[-1])
-            turned = float(np.linalg.norm(v_mps - self._v_mps[-1])) > JUMP_MPS + JUMP_MPS2 * dt
-            if turned or reset_counter != self._reset_counter or float(np.linalg.norm(left)) > JUMP_M + dt:
+            before_mps = self._v_mps[-1]
+            expected_m = self._xyz_m[-1] + 0.5 * dt * (v_mps + before_mps)
+            turned = math.dist(v_mps, before_mps) > JUMP_MPS + JUMP_MPS2 * dt
+            if turned or reset_counter != self._reset_counter or math.dist(xyz_m, expected_m) > JUMP_M + dt:
                 self.resets += 1
                 for kept in (self._ns, self._xyz_m, self._v_mps):
                     kept.clear()

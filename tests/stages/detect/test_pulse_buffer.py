@@ -9,7 +9,7 @@ import pytest
 
 from stages.detect.isolation import MAX_SLICES, RecentPulses
 from stages.kernels.detect.isolation import TALLY, count_sectors
-from stages.kernels.detect.pulse_buffer import WINDOW_NS
+from stages.kernels.detect.pulse_buffer import WINDOW_NS, count_sectors_all
 from stages.kernels.sweep.pulses import cone_of
 from stages.messages import SweptPulses
 
@@ -61,7 +61,7 @@ def test_the_buffer_counts_as_the_sum_of_its_slices(spread_rad) -> None:
         for slice_ in slices:  # a position some metres from one of its pulses, also at the edge of the search
             along = slice_.direction_vehicle[int(rng.integers(len(slice_.range_m)))].astype(float)
             centre_m = rng.uniform(1.5, 30.0) * along + rng.standard_normal(3) * rng.uniform(0.0, 3.0)
-            counts = recent.isolation(centre_m, *AROUND)
+            counts = count_sectors_all(*recent.arrays, centre_m, *AROUND)
             np.testing.assert_array_equal(counts, one_by_one(slices, centre_m))
             found += counts.sum()
     assert found > 500
@@ -76,5 +76,9 @@ def test_slices_before_the_window_or_beyond_the_capacity_are_dropped() -> None:
         add(late, dataclasses.replace(pulses, stamp_ns=0 if k < 2 else WINDOW_NS + 1))
         add(many, pulses)
         if k == 4:
-            np.testing.assert_array_equal(late.isolation(centre_m, *AROUND), one_by_one(made[2:5], centre_m))
-    np.testing.assert_array_equal(many.isolation(centre_m, *AROUND), one_by_one(made[-MAX_SLICES:], centre_m))
+            np.testing.assert_array_equal(
+                count_sectors_all(*late.arrays, centre_m, *AROUND), one_by_one(made[2:5], centre_m)
+            )
+    np.testing.assert_array_equal(
+        count_sectors_all(*many.arrays, centre_m, *AROUND), one_by_one(made[-MAX_SLICES:], centre_m)
+    )

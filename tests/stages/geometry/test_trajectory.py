@@ -193,6 +193,34 @@ def test_a_cached_result_is_the_same_until_a_newer_pose_arrives():
     np.testing.assert_allclose(made.at(soon)[1], (1.5, 0.1, 0))
 
 
+@pytest.mark.parametrize("poses", [0, 1, 2, 30])
+def test_the_poses_of_many_times_are_those_of_each_time(poses):
+    path = trail(*(driving(k) for k in range(poses)))
+    newest_ns = START_NS if path.newest_ns is None else path.newest_ns
+    spans_ns = (60 * MS, 5_000 * MS)  # within the newest poses, and before the oldest
+    for span_ns in spans_ns:
+        stamps_ns = newest_ns + np.linspace(-span_ns, 2 * FURTHEST_NS, 41).astype(np.int64)
+        stamps_ns = np.append(stamps_ns, newest_ns)
+        R, t = path.at_each(stamps_ns)
+        assert R.shape == (len(stamps_ns), 3, 3)
+        assert t.shape == (len(stamps_ns), 3)
+        for k, stamp_ns in enumerate(stamps_ns.tolist()):
+            R_one, t_one = path.at(stamp_ns)
+            np.testing.assert_array_equal(R[k], R_one)
+            np.testing.assert_array_equal(t[k], t_one)
+
+
+def test_the_poses_of_many_times_follow_a_newer_pose():
+    path = trail(*(driving(k) for k in range(10)))
+    stamps_ns = np.array([path.newest_ns + 5 * MS, path.newest_ns + 10 * MS])
+    before = path.at_each(stamps_ns)
+    path.add(motion(path.newest_ns + 20 * MS, path.at(path.newest_ns)[1] + [0.0, 0.1, 0.0], path.at(path.newest_ns)[0]))
+    R, t = path.at_each(stamps_ns)
+    assert not np.array_equal(t, before[1])
+    np.testing.assert_array_equal(t, [path.at(stamp_ns)[1] for stamp_ns in stamps_ns.tolist()])
+    np.testing.assert_array_equal(R, [path.at(stamp_ns)[0] for stamp_ns in stamps_ns.tolist()])
+
+
 def test_extrapolation_ends_at_its_horizon():
     made = trail(motion(0, (0, 0, 0)), motion(100 * MS, (1, 0, 0)))  # 10 m/s
     np.testing.assert_allclose(made.at(START_NS + 150 * MS)[1], (1.5, 0, 0))

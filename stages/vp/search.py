@@ -17,6 +17,7 @@ from stages.geometry.lens import Array64
 from stages.kernels.vp.directions import PARTS, all_directions, parts_of, upright, without
 from stages.kernels.vp.spectrum import APART_RAD
 from stages.vp.directions import Lines, Structure, assign, jackknife, refine, residual_sigma
+from stages.vp.rivals import Rivals, compare
 from stages.vp.spectrum import pair_support, peaks, wrap_90deg, yaw_spectrum
 from stages.vp.verticals import propose_verticals, refine_vertical
 
@@ -27,8 +28,6 @@ FURTHER_SCORE = 1.5  # added to `min_score` for further pairs
 PEAKS = 3  # highest peaks of the yaw spectrum to refine for the first pair
 DUPLICATE_RAD = math.radians(1.0)  # refined verticals nearer than this are one
 TRIAL_ITERATIONS = 4
-RIVAL_RAD = math.radians(3.0)  # a vertical farther than this from the best one is a rival
-RIVAL_SHARE = 0.85  # a rival with more than this share of the best agreement makes the result ambiguous
 MIN_DIRECTION_LINES = 2  # of a horizontal direction
 MAX_REJECTED = 3  # further pairs that are tried in vain
 
@@ -85,30 +84,28 @@ def find_structure(lines: Lines, prior: VerticalPrior, limits: SearchLimits) -> 
         v = refine_vertical(lines, start, prior.up, prior.sigma_rad, limits.sigma_model, gate)
         if all(abs(float(v @ other)) < math.cos(DUPLICATE_RAD) for other in verticals):
             verticals.append(v)
-    pairs = sorted((_best_pair(lines, v, prior, limits) for v in verticals), key=lambda p: -p.agreement)
-    for other in pairs[1:]:
-        is_rival = abs(float(other.axes[:, 2] @ pairs[0].axes[:, 2])) < math.cos(RIVAL_RAD)
-        if is_rival and other.agreement > RIVAL_SHARE * pairs[0].agreement:
-            return _no_directions(m, "ambiguous: two verticals fit the lines about equally well; connect an attitude")
+    pairs = sorted((p for v in verticals for p in _pairs(lines, v, prior, limits)), key=lambda p: -p.agreement)
     yaws, confident, peak = _frames(lines, pairs[0].axes, limits)
     if not yaws:
         vertical = verticals[0] if len(verticals) == 1 else pairs[0].axes[:, 2]
         return _vertical_only(lines, vertical, prior, limits, peak)
     structure = refine(lines, pairs[0].axes, np.array(yaws), prior.up, prior.sigma_rad, limits.sigma_model)
-    return _directions_of(lines, structure, confident, limits)
+    rivals = compare(lines, structure.axes, [pair.axes for pair in pairs], limits.sigma_model)
+    if rivals.ambiguous:
+        return _no_directions(m, "ambiguous: two verticals fit the lines about equally well; connect an attitude")
+    return _directions_of(lines, structure, confident, rivals, limits)
 
 
-def _best_pair(lines: Lines, vertical: Array64, prior: VerticalPrior, limits: SearchLimits) -> Structure:
-    """The vertical and one horizontal pair, refined from each of the highest peaks of the spectrum; the best one."""
+def _pairs(lines: Lines, vertical: Array64, prior: VerticalPrior, limits: SearchLimits) -> list[Structure]:
+    """The vertical and one horizontal pair, refined from each of the highest peaks of the spectrum."""
     axes = upright(vertical)
     spectrum = yaw_spectrum(lines, axes, ~_along_vertical(lines, vertical, limits), limits.sigma_model, BINS)
-    found = [
+    return [
         refine(
             lines, axes @ _about_z(yaw), np.zeros(1), prior.up, prior.sigma_rad, limits.sigma_model, TRIAL_ITERATIONS
         )
         for yaw in peaks(spectrum, PEAKS)
     ]
-    return max(found, key=lambda s: s.agreement)
 
 
 def _along_vertical(lines: Lines, vertical: Array64, limits: SearchLimits) -> NDArray[np.bool_]:
@@ -158,12 +155,20 @@ def _near(lines: Lines, axes: Array64, yaw: float, limits: SearchLimits) -> NDAr
     return assign(lines, directions, 2.0 * limits.sigma_model)[0] >= 0
 
 
-def _directions_of(lines: Lines, s: Structure, confident: list[bool], limits: SearchLimits) -> FoundDirections:
-    """The directions that have lines; sigmas by the larger of information matrix and jackknife, with `least_sigma`."""
+def _directions_of(
+    lines: Lines, s: Structure, confident: list[bool], rivals: Rivals, limits: SearchLimits
+) -> FoundDirections:
+    """The directions that have lines.
+
+    Sigmas by the larger of information matrix and jackknife, with the rivals and `least_sigma`.
+    """
     directions = all_directions(s.axes, s.yaw_rad)
     counts = np.bincount(s.assigned[s.assigned >= 0], minlength=len(directions))
     cov: Array64 = np.linalg.inv(s.information).astype(np.float64) * max(s.scatter, limits.least_scatter) ** 2
-    sigma = _sigmas(np.array([cov, jackknife(lines, s, limits.sigma_model)]), directions @ s.axes)
+    local = directions @ s.axes
+    sigma = np.hypot(
+        _sigmas(np.array([cov, jackknife(lines, s, limits.sigma_model)]), local), np.sqrt(rivals.variance_rad2(local))
+    )
     rows: list[Array64] = []
     sigmas: list[float] = []
     frames: list[int] = []
@@ -176,7 +181,7 @@ def _directions_of(lines: Lines, s: Structure, confident: list[bool], limits: Se
         number[k] = len(rows)
         rows.append(d)
         frames.append(f)
-        sigmas.append(math.hypot(sigma[k], limits.least_sigma, 0.0 if f < 0 or confident[f] else limits.weak_sigma))
+        sigmas.append(math.hypot(float(sigma[k]), limits.least_sigma, 0.0 if f < 0 or confident[f] else limits.weak_sigma))
     line_direction = np.where(s.assigned >= 0, number[s.assigned], -1)
     if not rows:
         return _no_directions(len(lines.normal), "no direction has enough lines after refinement")

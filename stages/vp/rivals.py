@@ -1,0 +1,103 @@
+"""Rivals of the best structure: others that fit about as well, and what they add to its sigmas.
+
+    d_k = A_k(best) - A_k(rival),   D = sum d_k,   s_D^2 = n / (n - 1) sum (d_k - D / n)^2,   P = 1 - Phi(D / s_D)
+
+A_k is the agreement with the lines in part k of n; P is the probability that the rival fits other lines of the scene
+better. The lines of one object lie in one part, so that D is significant only when several objects agree on it. Each
+rival i, turned by v_i against the best, adds to the variance of a direction d
+
+    sum w_i |v_i x d|^2 / (1 + sum w_i),   w_i = P_i / (1 - P_i),   P_i at most 1/2
+
+as in a mixture, about its best component. A rival with another vertical is no error of the best but another answer:
+it makes the result ambiguous, unless it is rejected at RIVAL_LEVEL.
+
+Source: ours; difference of fits with its sampling error: Vuong, Econometrica 57, 1989.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from stages.geometry.frames import rotation_z
+from stages.geometry.lens import Array64
+from stages.kernels.geometry.so3 import log_rotation
+from stages.kernels.vp.rivals import agreement_of_parts, equal_parts
+from stages.kernels.vp.spectrum import APART_RAD
+from stages.vp.directions import Lines
+
+RIVAL_RAD = math.radians(3.0)  # a vertical farther than this from the best one is another answer
+RIVAL_LEVEL = 0.05  # significance level, one-sided
+SAME_RAD = math.radians(0.5)  # structures nearer than this are one
+
+
+@dataclass(frozen=True)
+class Rivals:
+    """Whether another answer is not rejected, and the turns by which near rivals widen the best structure."""
+
+    ambiguous: bool
+    turn_rad: Array64  # (n, 3) in the axes of the best structure
+    share: Array64  # (n,) of each in the mixture
+
+    def variance_rad2(self, local: Array64) -> Array64:
+        """Variance (k,) that the rivals add to directions (k, 3) in the axes of the best structure."""
+        return np.square(np.cross(self.turn_rad[:, None], local[None])).sum(axis=2).T @ self.share
+
+
+def compare(lines: Lines, axes: Array64, others: Sequence[Array64], sigma_model: float) -> Rivals:
+    """Compare the Manhattan frame `axes` (3, 3) with others, all as R_mount_frame with the vertical as third column."""
+    far: list[Array64] = []
+    for other in others:
+        if all(np.linalg.norm(turn_between(one, other)) > SAME_RAD for one in (axes, *far)):
+            far.append(other)
+    if not far:
+        return Rivals(False, np.empty((0, 3)), np.empty(0))
+    part = equal_parts(lines.normal, lines.tangent, lines.weight, np.ascontiguousarray(axes))
+    best = _agreement(lines, axes, sigma_model, part)
+    turns: list[Array64] = []
+    weights: list[float] = []
+    for other in far:
+        p = probability_better(best - _agreement(lines, other, sigma_model, part))
+        if abs(float(axes[:, 2] @ other[:, 2])) < math.cos(RIVAL_RAD):
+            if p > RIVAL_LEVEL:
+                return Rivals(True, np.empty((0, 3)), np.empty(0))
+            continue
+        turns.append(turn_between(axes, other))
+        weights.append(p / (1.0 - p))
+    w = np.array(weights)
+    return Rivals(False, np.array(turns).reshape(-1, 3), w / (1.0 + w.sum()))
+
+
+def turn_between(axes: Array64, other: Array64) -> Array64:
+    """Rotation vector (3,) from one Manhattan frame to another, in the axes of the first, modulo 90 deg of yaw.
+
+    Frames with yaws APART_RAD and more apart are different pairs: the rotation is that of the vertical alone.
+    """
+    turns = [log_rotation(np.ascontiguousarray(axes.T @ other @ rotation_z(k * math.pi / 2))) for k in range(4)]
+    turn = min(turns, key=lambda v: float(np.linalg.norm(v)))
+    if abs(turn[2]) < APART_RAD:
+        return turn
+    x, y, _ = axes.T @ other[:, 2]
+    return np.array([-y, x, 0.0])
+
+
+def probability_better(difference: Array64) -> float:
+    """Probability, at most 1/2, that the second of two structures fits better, by differences (n,) of n parts."""
+    n = len(difference)
+    sigma = math.sqrt(n * float(np.var(difference, ddof=1)))
+    return min(0.5 * math.erfc(float(difference.sum()) / max(sigma * math.sqrt(2.0), 1e-12)), 0.5)
+
+
+def _agreement(lines: Lines, axes: Array64, sigma_model: float, part: Array64) -> Array64:
+    return agreement_of_parts(
+        lines.normal,
+        lines.tangent,
+        lines.sigma_rad,
+        lines.weight,
+        np.ascontiguousarray(axes),
+        sigma_model,
+        part,
+    )

@@ -181,7 +181,9 @@ def _directions_of(
         number[k] = len(rows)
         rows.append(d)
         frames.append(f)
-        sigmas.append(math.hypot(float(sigma[k]), limits.least_sigma, 0.0 if f < 0 or confident[f] else limits.weak_sigma))
+        sigmas.append(
+            math.hypot(float(sigma[k]), limits.least_sigma, 0.0 if f < 0 or confident[f] else limits.weak_sigma)
+        )
     line_direction = np.where(s.assigned >= 0, number[s.assigned], -1)
     if not rows:
         return _no_directions(len(lines.normal), "no direction has enough lines after refinement")

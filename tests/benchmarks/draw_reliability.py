@@ -20,11 +20,12 @@ from matplotlib import pyplot as plt
 from stages.geometry.lens_files import lens_from_ocamcalib
 from stages.messages import CameraMount, Image
 from stages.vp import GreatCircleVp
-from tests.benchmarks.bench_vp import R_MOUNT_CAMERA, YORK, forward_stage, york_image, york_stage, york_truth
+from tests.benchmarks.bench_vp import R_MOUNT_CAMERA, forward_stage, york_stage
 from tests.stages import panoramas
 from tests.stages.panoramas import DirectionErrors, direction_errors
 from tests.stages.reliability import DATA, grd_stage
 from tests.stages.simulated_views import SCENES, View, views
+from tests.stages.york_urban import labelled, york_folders, york_image, york_truth
 
 IMAGES = Path(__file__).resolve().parents[2] / "docs" / "images"
 SEED = 201  # of worlds that no threshold was chosen with
@@ -111,22 +112,35 @@ def real_groups(count: int) -> Groups:
             group = "panorama kept back" if name == panoramas.KEPT_BACK else "three panoramas"
             for mount in CameraMount:
                 groups.setdefault(group, []).extend(panoramas.errors_of_renders(name, mount, count, SEED))
-    if YORK.exists():
-        groups["York, training half"] = york()
+    return {**groups, **york()}
+
+
+def york() -> Groups:
+    """Three directions of each image, without gravity, against the published directions and the labelled lines.
+
+    The last group has the sigma of the labels in that of the answer.
+    """
+    vp = york_stage()
+    groups: Groups = {}
+    for folder in york_folders():
+        directions = vp.on_image(york_image(folder))
+        sigma, has_frame = np.degrees(directions.sigma_rad), bool((directions.frame >= 0).any())
+        lines = labelled(folder)
+        label_sigma = lines.sigma_deg[_nearest(directions.direction, lines.direction)[1]]
+        for name, truth, stated in (
+            ("York, published directions", york_truth(folder), sigma),
+            ("York, labelled lines", lines.direction, sigma),
+            ("York, labelled lines and their sigma", lines.direction, np.hypot(sigma, label_sigma)),
+        ):
+            error = _nearest(directions.direction, truth)[0]
+            groups.setdefault(name, []).append(DirectionErrors(error, stated, has_frame, directions.reason))
     return groups
 
 
-def york() -> list[DirectionErrors]:
-    """Three directions of each image, without gravity; labels good to about 1 deg."""
-    vp = york_stage()
-    found: list[DirectionErrors] = []
-    for folder in sorted(YORK.glob("P*")):
-        directions = vp.on_image(york_image(folder))
-        cosine = np.abs(directions.direction @ R_MOUNT_CAMERA @ york_truth(folder).T)
-        error = np.degrees(np.arccos(np.clip(cosine.max(axis=1, initial=0.0), 0.0, 1.0)))
-        has_frame = bool((directions.frame >= 0).any())
-        found.append(DirectionErrors(error, np.degrees(directions.sigma_rad), has_frame, directions.reason))
-    return found
+def _nearest(direction: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Angle [deg] of each direction (n, 3), mount axes, to the nearest true one, camera axes, and its index."""
+    cosine = np.abs(direction @ R_MOUNT_CAMERA @ truth.T)
+    return np.degrees(np.arccos(np.clip(cosine.max(axis=1), 0.0, 1.0))), cosine.argmax(axis=1)
 
 
 def corridor() -> str:

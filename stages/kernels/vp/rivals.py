@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.geometry.lens import Array64
-from stages.kernels.compiled import compiled
+from stages.kernels.compiled import compiled_at_once
 from stages.kernels.vp.directions import GATE, NONE, PARTS, all_directions, assign_kernel
 
 
-@compiled
+@compiled_at_once("(float64[:, ::1], float64[:, ::1], float64[::1], float64[:, ::1])")
 def equal_parts(normal: Array64, tangent: Array64, weight: Array64, axes: Array64) -> NDArray[np.int64]:
     """The part (m,) of each line: PARTS groups of neighbouring azimuths about axes[:, 2], of equal weight.
 
@@ -44,7 +44,9 @@ def equal_parts(normal: Array64, tangent: Array64, weight: Array64, axes: Array6
     return part
 
 
-@compiled
+@compiled_at_once(
+    "(float64[:, ::1], float64[:, ::1], float64[::1], float64[::1], float64[:, ::1], float64, int64[::1])"
+)
 def agreement_of_parts(
     normal: Array64,
     tangent: Array64,

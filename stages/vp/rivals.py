@@ -8,8 +8,8 @@ rival i, turned by v_i against the best, adds to the variance of a direction d
 
     sum w_i |v_i x d|^2 / (1 + sum w_i),   w_i = P_i / (1 - P_i),   P_i at most 1/2
 
-as in a mixture, about its best component. A rival with another vertical is no error of the best but another answer:
-it makes the result ambiguous, unless it is rejected at RIVAL_LEVEL.
+as in a mixture, about its best component. A rival with another vertical is no error of the best but another answer,
+of weight w_i, unless it is rejected at RIVAL_LEVEL.
 
 Source: ours; difference of fits with its sampling error: Vuong, Econometrica 57, 1989.
 """
@@ -36,9 +36,9 @@ SAME_RAD = math.radians(0.5)  # structures nearer than this are one
 
 @dataclass(frozen=True)
 class Rivals:
-    """Whether another answer is not rejected, and the turns by which near rivals widen the best structure."""
+    """Other answers that are not rejected, and the turns by which near rivals widen the best structure."""
 
-    ambiguous: bool
+    answers: tuple[tuple[int, float], ...]  # index and weight of each, best first; the best structure has weight 1
     turn_rad: Array64  # (n, 3) in the axes of the best structure
     share: Array64  # (n,) of each in the mixture
 
@@ -49,26 +49,27 @@ class Rivals:
 
 def compare(lines: Lines, axes: Array64, others: Sequence[Array64], sigma_model: float) -> Rivals:
     """Compare the Manhattan frame `axes` (3, 3) with others, all as R_mount_frame with the vertical as third column."""
-    far: list[Array64] = []
-    for other in others:
-        if all(np.linalg.norm(turn_between(one, other)) > SAME_RAD for one in (axes, *far)):
-            far.append(other)
-    if not far:
-        return Rivals(False, np.empty((0, 3)), np.empty(0))
     part = equal_parts(lines.normal, lines.tangent, lines.weight, np.ascontiguousarray(axes))
     best = _agreement(lines, axes, sigma_model, part)
+    seen, verticals = [axes], [axes[:, 2]]
+    answers: list[tuple[int, float]] = []
     turns: list[Array64] = []
     weights: list[float] = []
-    for other in far:
-        p = probability_better(best - _agreement(lines, other, sigma_model, part))
-        if abs(float(axes[:, 2] @ other[:, 2])) < math.cos(RIVAL_RAD):
-            if p > RIVAL_LEVEL:
-                return Rivals(True, np.empty((0, 3)), np.empty(0))
+    for k, other in enumerate(others):
+        if any(np.linalg.norm(turn_between(one, other)) <= SAME_RAD for one in seen):
             continue
-        turns.append(turn_between(axes, other))
-        weights.append(p / (1.0 - p))
+        seen.append(other)
+        p = probability_better(best - _agreement(lines, other, sigma_model, part))
+        if abs(float(axes[:, 2] @ other[:, 2])) > math.cos(RIVAL_RAD):
+            turns.append(turn_between(axes, other))
+            weights.append(p / (1.0 - p))
+        elif p > RIVAL_LEVEL and all(abs(float(v @ other[:, 2])) < math.cos(RIVAL_RAD) for v in verticals):
+            verticals.append(other[:, 2])
+            answers.append((k, p / (1.0 - p)))
     w = np.array(weights)
-    return Rivals(False, np.array(turns).reshape(-1, 3), w / (1.0 + w.sum()))
+    return Rivals(
+        tuple(sorted(answers, key=lambda answer: -answer[1])), np.array(turns).reshape(-1, 3), w / (1.0 + w.sum())
+    )
 
 
 def turn_between(axes: Array64, other: Array64) -> Array64:

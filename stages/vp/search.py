@@ -8,7 +8,7 @@ Source: ours, for P IV.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from stages.geometry.lens import Array64
 from stages.kernels.vp.directions import PARTS, all_directions, parts_of, upright, without
 from stages.kernels.vp.spectrum import APART_RAD
+from stages.messages import WeightedAnswers
 from stages.vp.directions import Lines, Structure, assign, jackknife, refine, residual_sigma
 from stages.vp.rivals import Rivals, compare
 from stages.vp.spectrum import pair_support, peaks, wrap_90deg, yaw_spectrum
@@ -67,10 +68,11 @@ class FoundDirections:
     frame: NDArray[np.int64]
     line_direction: NDArray[np.int64]
     reason: str
+    answers: WeightedAnswers | None = None
 
 
 def find_structure(lines: Lines, prior: VerticalPrior, limits: SearchLimits) -> FoundDirections:
-    """The best upright structure of the lines, or no direction and the reason."""
+    """The best upright structure of the lines; or several with weights; or no direction and the reason."""
     m = len(lines.normal)
     if m < limits.min_lines:
         return _no_directions(m, f"too few straight lines: {m}")
@@ -89,10 +91,12 @@ def find_structure(lines: Lines, prior: VerticalPrior, limits: SearchLimits) -> 
     if not yaws:
         vertical = verticals[0] if len(verticals) == 1 else pairs[0].axes[:, 2]
         return _vertical_only(lines, vertical, prior, limits, peak)
-    structure = refine(lines, pairs[0].axes, np.array(yaws), prior.up, prior.sigma_rad, limits.sigma_model)
+    given = prior.up, prior.sigma_rad, limits.sigma_model
+    structure = refine(lines, pairs[0].axes, np.array(yaws), *given)
     rivals = compare(lines, structure.axes, [pair.axes for pair in pairs], limits.sigma_model)
-    if rivals.ambiguous:
-        return _no_directions(m, "ambiguous: two verticals fit the lines about equally well; connect an attitude")
+    if rivals.answers:  # best first
+        others = [refine(lines, pairs[k].axes, np.zeros(1), *given) for k, _ in rivals.answers]
+        return _ambiguous(lines, [structure, *others], [1.0, *(weight for _, weight in rivals.answers)], limits)
     return _directions_of(lines, structure, confident, rivals, limits)
 
 
@@ -232,6 +236,24 @@ def _vertical_only(
         return _no_directions(len(near), f"{reason}; parts of the upright lines disagree")
     none = np.array([-1], dtype=np.int64)
     return FoundDirections(v[None], np.array([sigma]), none, np.where(near, 0, -1).astype(np.int64), reason)
+
+
+def _ambiguous(lines: Lines, found: list[Structure], weights: list[float], limits: SearchLimits) -> FoundDirections:
+    """No single answer: structures with their weights, each with its vertical and its first horizontal pair."""
+    z = np.array([[0.0, 0.0, 1.0]])
+    sigmas: list[float] = []
+    for s in found:
+        cov: Array64 = np.linalg.inv(s.information).astype(np.float64) * max(s.scatter, limits.least_scatter) ** 2
+        (sigma,) = _sigmas(np.array([cov, jackknife(lines, s, limits.sigma_model)]), z)
+        sigmas.append(math.hypot(sigma, limits.least_sigma))
+    answers = WeightedAnswers(
+        up=np.array([s.axes[:, 2] for s in found]),
+        sigma_rad=np.array(sigmas),
+        probability=np.array(weights) / sum(weights),
+        line_direction=np.array([np.where(s.assigned < 3, s.assigned, -1) for s in found], dtype=np.int64),
+    )
+    reason = f"ambiguous: {len(found)} verticals fit the lines about equally well; connect an attitude"
+    return replace(_no_directions(len(lines.normal), reason), answers=answers)
 
 
 def _no_directions(m: int, reason: str) -> FoundDirections:

@@ -48,7 +48,7 @@ def test_the_turn_between_two_frames_is_modulo_90_deg_of_yaw():
 
 
 def test_a_rival_widens_a_direction_by_its_turn_and_share():
-    rivals = Rivals(False, np.array([[0.0, 0.0, 0.02]]), np.array([0.25]))
+    rivals = Rivals((), np.array([[0.0, 0.0, 0.02]]), np.array([0.25]))
     np.testing.assert_allclose(rivals.variance_rad2(np.eye(3)), [1e-4, 1e-4, 0.0], atol=1e-12)
 
 
@@ -87,7 +87,7 @@ def test_two_structures_some_degrees_apart_have_a_sigma_that_covers_both(monkeyp
 
     assert within(found, np.eye(3))
     assert within(found, turned)
-    monkeypatch.setattr(search, "compare", lambda *_: Rivals(False, np.empty((0, 3)), np.empty(0)))
+    monkeypatch.setattr(search, "compare", lambda *_: Rivals((), np.empty((0, 3)), np.empty(0)))
     without = find_structure(lines, CONE, ONE_FRAME)
     assert not (within(without, np.eye(3)) and within(without, turned))
 
@@ -98,6 +98,13 @@ def test_two_structures_with_other_verticals_are_ambiguous_unless_one_is_better_
     found = find_structure(equal, CONE, ONE_FRAME)
     assert len(found.direction) == 0
     assert "ambiguous" in found.reason
+    assert found.answers is not None
+    assert found.answers.probability.sum() == pytest.approx(1.0)
+    assert np.all(np.abs(found.answers.probability - 0.5) < 0.45)
+    for up, truth in zip(found.answers.up[np.argsort(found.answers.up[:, 0])], (UP, turned[:, 2]), strict=True):
+        assert np.degrees(np.arccos(up @ truth)) < 0.5
+    along_pair = (found.answers.line_direction > 0).sum(axis=1)
+    assert np.all(along_pair >= 30)
     weaker = together(frame(np.eye(3), seed=3, each=40), frame(turned, seed=4, each=8))
     assert len(find_structure(weaker, CONE, ONE_FRAME).direction) == 3
 
@@ -105,5 +112,5 @@ def test_two_structures_with_other_verticals_are_ambiguous_unless_one_is_better_
 def test_a_clear_structure_has_no_rival():
     lines = frame(np.eye(3), seed=5, each=30, loose=10)
     rivals = compare(lines, np.eye(3), [np.eye(3), rotation_from_rpy_deg((2.5, 0.0, 0.0))], SIGMA)
-    assert not rivals.ambiguous
+    assert not rivals.answers
     assert np.degrees(np.sqrt(rivals.variance_rad2(np.eye(3)))).max() < 0.02

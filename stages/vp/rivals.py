@@ -31,6 +31,7 @@ from stages.vp.directions import Lines
 
 RIVAL_RAD = math.radians(3.0)  # a vertical farther than this from the best one is another answer
 RIVAL_LEVEL = 0.05  # significance level, one-sided
+QUARTERS = np.array([rotation_z(k * math.pi / 2) for k in range(4)])
 SAME_RAD = math.radians(0.5)  # structures nearer than this are one
 
 
@@ -44,7 +45,8 @@ class Rivals:
 
     def variance_rad2(self, local: Array64) -> Array64:
         """Variance (k,) that the rivals add to directions (k, 3) in the axes of the best structure."""
-        return np.square(np.cross(self.turn_rad[:, None], local[None])).sum(axis=2).T @ self.share
+        squared = np.square(self.turn_rad).sum(axis=1) - np.square(local @ self.turn_rad.T)  # |v x d|^2, |d| = 1
+        return np.maximum(squared, 0.0) @ self.share
 
 
 def compare(lines: Lines, axes: Array64, others: Sequence[Array64], sigma_model: float) -> Rivals:
@@ -77,12 +79,12 @@ def turn_between(axes: Array64, other: Array64) -> Array64:
 
     Frames with yaws APART_RAD and more apart are different pairs: the rotation is that of the vertical alone.
     """
-    turns = [log_rotation(np.ascontiguousarray(axes.T @ other @ rotation_z(k * math.pi / 2))) for k in range(4)]
-    turn = min(turns, key=lambda v: float(np.linalg.norm(v)))
+    R = axes.T @ other
+    quarters = round(math.atan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1]) / (math.pi / 2))
+    turn = log_rotation(np.ascontiguousarray(R @ QUARTERS[-quarters % 4]))
     if abs(turn[2]) < APART_RAD:
         return turn
-    x, y, _ = axes.T @ other[:, 2]
-    return np.array([-y, x, 0.0])
+    return np.array([-R[1, 2], R[0, 2], 0.0])
 
 
 def probability_better(difference: Array64) -> float:

@@ -134,8 +134,8 @@ def test_the_tilt_covariance_includes_errors_of_mount_and_lens():
     for seed in range(150):
         off_v, off_d = exp_rotation(rng.normal(0, off_rad)), exp_rotation(rng.normal(0, off_rad))
         match = pair(
-            seen(CameraMount.VEHICLE, R_vehicle @ off_v, ATLANTA, seed=seed),
-            seen(CameraMount.DRONE, R_drone @ off_d, ATLANTA, seed=seed),
+            seen(CameraMount.VEHICLE, R_vehicle @ off_v, ATLANTA, up_error_rad=0.004, seed=seed),
+            seen(CameraMount.DRONE, R_drone @ off_d, ATLANTA, up_error_rad=0.004, seed=seed),
             tilt_sigma_deg=0.07,
         )
         branches = (turned(0, 0, 25 + quarter).T @ match.R_vehicle_drone for quarter in (0, 90, 180, 270))

@@ -1,7 +1,7 @@
 """Rotation of the drone relative to the vehicle, from the lines of both cameras.
 
     pairs of images (pairing.py) -> yaw spectra and their matches, each with a probability (spectra.py)
-      -> all angles refined together, for each match (refine.py) -> message
+      -> yaw and streets refined together, for each match (refine.py) -> message
 
 Each image of the drone gives the rotations that the lines of one pair allow, or the reason why there is none. No match
 is chosen here, and no branch of 90 deg: the heading (stages/heading) weighs all of them by the drone's motion. Where an

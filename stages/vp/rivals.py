@@ -51,22 +51,27 @@ class Rivals:
 
 def compare(lines: Lines, axes: Array64, others: Sequence[Array64], sigma_model: float) -> Rivals:
     """Compare the Manhattan frame `axes` (3, 3) with others, all as R_mount_frame with the vertical as third column."""
+    different: list[int] = []
+    for k, other in enumerate(others):
+        seen = (axes, *(others[i] for i in different))
+        if all(np.linalg.norm(turn_between(one, other)) > SAME_RAD for one in seen):
+            different.append(k)
+    if not different:
+        return Rivals((), np.empty((0, 3)), np.empty(0))
     part = equal_parts(lines.normal, lines.tangent, lines.weight, np.ascontiguousarray(axes))
     best = _agreement(lines, axes, sigma_model, part)
-    seen, verticals = [axes], [axes[:, 2]]
+    verticals = [axes[:, 2]]
     answers: list[tuple[int, float]] = []
     turns: list[Array64] = []
     weights: list[float] = []
-    for k, other in enumerate(others):
-        if any(np.linalg.norm(turn_between(one, other)) <= SAME_RAD for one in seen):
-            continue
-        seen.append(other)
-        p = probability_better(best - _agreement(lines, other, sigma_model, part))
-        if abs(float(axes[:, 2] @ other[:, 2])) > math.cos(RIVAL_RAD):
-            turns.append(turn_between(axes, other))
+    for k in different:
+        p = probability_better(best - _agreement(lines, others[k], sigma_model, part))
+        up = others[k][:, 2]
+        if abs(float(axes[:, 2] @ up)) > math.cos(RIVAL_RAD):
+            turns.append(turn_between(axes, others[k]))
             weights.append(p / (1.0 - p))
-        elif p > RIVAL_LEVEL and all(abs(float(v @ other[:, 2])) < math.cos(RIVAL_RAD) for v in verticals):
-            verticals.append(other[:, 2])
+        elif p > RIVAL_LEVEL and all(abs(float(v @ up)) < math.cos(RIVAL_RAD) for v in verticals):
+            verticals.append(up)
             answers.append((k, p / (1.0 - p)))
     w = np.array(weights)
     return Rivals(

@@ -21,6 +21,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stages.geometry.frames import rotation_z
 from stages.geometry.lens import Array64
@@ -99,7 +100,7 @@ def probability_better(difference: Array64) -> float:
     return min(0.5 * math.erfc(float(difference.sum()) / max(sigma * math.sqrt(2.0), 1e-12)), 0.5)
 
 
-def _agreement(lines: Lines, axes: Array64, sigma_model: float, part: Array64) -> Array64:
+def _agreement(lines: Lines, axes: Array64, sigma_model: float, part: NDArray[np.int64]) -> Array64:
     return agreement_of_parts(
         lines.normal,
         lines.tangent,

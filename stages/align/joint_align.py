@@ -1,10 +1,11 @@
 """Rotation of the drone relative to the vehicle, from the lines of both cameras.
 
     pairs of images (pairing.py) -> yaw spectra and their matches, each with a probability (spectra.py)
-      -> all angles refined together, for each match (refine.py) -> message
+      -> yaw and streets refined together, for each match (refine.py) -> message
 
 Each image of the drone gives the rotations that the lines of one pair allow, or the reason why there is none. No match
-is chosen here, and no branch of 90 deg: the heading (stages/heading) weighs all of them by the drone's motion.
+is chosen here, and no branch of 90 deg: the heading (stages/heading) weighs all of them by the drone's motion. Where an
+image has several answers with different verticals, each is matched; the gyro and gravity of the heading select one.
 
 Between the two images of a pair the vehicle turns as its odometry says; without it, as fast as a vehicle may.
 
@@ -23,7 +24,7 @@ from pydantic import Field
 from flow.stage import Settings, Stage
 from stages.align.pairing import Pair, Pairing, of_mount
 from stages.align.refine import Refined, Tolerances, refine, street_directions
-from stages.align.spectra import LevelLines, level_lines, match_probabilities, overlap, peaks, spectrum
+from stages.align.spectra import LevelLines, match_probabilities, overlap, peaks, spectrum, weighted_lines
 from stages.geometry.frames import Array64
 from stages.geometry.trajectory import VehicleTrajectory
 from stages.messages import BranchState, CameraMount, RelativeRotation, VanishingDirections, VehicleMotion
@@ -87,23 +88,31 @@ class JointAlign(Stage[JointAlignSettings]):
         if seen_by_vehicle is None:
             return RelativeRotation.none(drone_ns, f"no image of the vehicle camera within {settings.max_apart_s:g} s")
         straight_rad = self._tolerances.straight_rad
-        vehicle, drone = level_lines(seen_by_vehicle, straight_rad), level_lines(seen_by_drone, straight_rad)
-        if vehicle is None or drone is None or min(len(vehicle.weight), len(drone.weight)) < settings.min_lines:
+        vehicle, drone = (
+            [(lines, p) for lines, p in weighted_lines(seen, straight_rad) if len(lines.weight) >= settings.min_lines]
+            for seen in (seen_by_vehicle, seen_by_drone)
+        )
+        if not vehicle or not drone:
             both = ((seen_by_vehicle, vehicle), (seen_by_drone, drone))
-            few = (seen for seen, lines in both if lines is None or len(lines.weight) < settings.min_lines)
+            few = (seen for seen, answers in both if not answers)
             reason = "; ".join(f"{seen.camera_mount.value}: {seen.reason or 'too few level lines'}" for seen in few)
             return RelativeRotation.none(drone_ns, reason)
-        found = self._matches(vehicle, drone)
+        found = [
+            match
+            for of_vehicle, p_vehicle in vehicle
+            for of_drone, p_drone in drone
+            for match in self._matches(of_vehicle, of_drone, p_vehicle * p_drone)
+        ]
         if not found:
             return RelativeRotation.none(drone_ns, "too few lines of both cameras run along the same streets")
-        return self._message(seen_by_vehicle.stamp_ns, drone_ns, found)
+        return self._message(seen_by_vehicle.stamp_ns, drone_ns, sorted(found, key=lambda match: -match[1]))
 
-    def _matches(self, vehicle: LevelLines, drone: LevelLines) -> list[tuple[Refined, float]]:
-        """The refined matches with their probabilities, most probable first."""
+    def _matches(self, vehicle: LevelLines, drone: LevelLines, answers: float) -> list[tuple[Refined, float]]:
+        """The refined matches of two answers, whose joint probability is `answers`, with their probabilities."""
         a, b = spectrum(vehicle), spectrum(drone)
         tops = peaks(overlap(a, b), MIN_SEPARATION_RAD)
         found: list[tuple[Refined, float]] = []
-        for top, probability in zip(tops, match_probabilities(tops).tolist(), strict=True):
+        for top, probability in zip(tops, (answers * match_probabilities(tops)).tolist(), strict=True):
             if probability < LEAST_PROBABILITY:
                 continue
             one = refine(vehicle, drone, street_directions(a, b, top.yaw_rad), top.yaw_rad, self._tolerances)

@@ -1,15 +1,20 @@
-"""Joint refinement of the tilts of both cameras, the yaw between them and the directions of the streets.
+"""Joint refinement of the yaw between both cameras and the directions of the streets.
 
-    unknown    tilt of each camera (2 angles each), yaw, azimuth a_k of each direction k, and its value in each camera
+    unknown    yaw, azimuth a_k of each direction k, and its value in each camera
     line i     n_i . h(a_vk) = 0 in the vehicle's level axes,  n_i . h(a_dk) = 0 in the drone's       robust weights
     camera     a_vk = a_k,  a_dk = a_k - yaw        up to `direction_rad`: errors that many lines share
     streets    a_j = a_k + 90 deg for two directions nearly at right angles      up to `square_rad`
-    tilt       that of the vertical of each image, up to its sigma
+    tilt       that of the vertical of each image: `vp` found it with the same lines, which give no more of it here
+
+With the unknowns x, the tilts p (2 angles each, covariance P) and the normal equations H of both,
+
+    S = -H_xx^-1 H_xp,   Cov(x) = H_xx^-1 + S P S^T,   Cov(x, p) = S P
 
 Lines along one street share errors of the lens, the image and the street, which do not average out however many lines
 there are. So each camera has its own estimate of each direction, and constraints tie only these estimates together.
 
-Source: ours, for P IV Eq. 7-10; DESIGN, Vision: raw covariance is overconfident (NEES/3 about 21).
+Source: ours, for P IV Eq. 7-10; tilts as considered parameters: Schmidt (1966); DESIGN, Vision: raw covariance is
+overconfident (NEES/3 about 21).
 """
 
 from __future__ import annotations
@@ -23,9 +28,9 @@ from numpy.typing import NDArray
 from stages.align.spectra import LevelLines
 from stages.geometry.frames import Array64, rotation_z
 from stages.kernels.align.spectra import BIN_RAD
-from stages.kernels.geometry.so3 import exp_rotation
 
-TILTS_AND_YAW = 5  # the first unknowns: tilt x, y of the vehicle, of the drone, yaw
+TILTS_AND_YAW = 5  # the first columns: tilt x, y of the vehicle, of the drone, yaw
+YAW = 4
 MOST_DIRECTIONS = 6
 APART_RAD = math.radians(4.0)  # directions nearer to each other are the same
 WEAKEST = 0.08  # share of the strongest direction, below which a direction is ignored
@@ -99,14 +104,13 @@ def half_turn_difference(angle_rad: float) -> float:
 
 @dataclass
 class _Camera:
-    """Lines of one camera by direction, and its level axes as refined so far."""
+    """Lines of one camera by direction, and its level axes."""
 
     R: Array64  # R_carrier_level
     normal: Array64  # (m, 3) camera_mount axes
     sigma: Array64  # (m,)
     k: NDArray[np.int64]  # (m,) index of the direction
     azimuth: Array64  # (K,) estimate of this camera, in its own level axes
-    tilt: Array64  # (2,) rotation so far from the measured vertical
     tilt_sigma_rad: float
     inflation: Array64  # (K,) sigma factor of each direction: few lines, or large residuals
     effective_lines: float = 0.0
@@ -147,7 +151,6 @@ def _camera(lines: LevelLines, directions: Array64, yaw_rad: float, allowed: Tol
         sigma=np.hypot(lines.sigma_rad[own], allowed.straight_rad * flat),
         k=k[own],
         azimuth=azimuth,
-        tilt=np.zeros(2),
         tilt_sigma_rad=math.hypot(lines.tilt_sigma_rad, allowed.tilt_rad),
         inflation=np.ones(len(directions)),
     )
@@ -177,9 +180,10 @@ def refine(
     shared = own_k[0] & own_k[1]
     if not shared and not any({i, j} & own_k[0] and {i, j} & own_k[1] for i, j in squares):
         return None
-    ties = _ties(K, squares, cameras, allowed)
+    ties = _ties(K, squares, allowed)
     information = np.eye(unknowns)
     weight = np.ones(len(ties))  # of the ties: reduced where the cameras disagree on a street
+    solved = slice(YAW, unknowns)
     for _ in range(ROUNDS):
         r_ties = _tie_residuals(a, yaw, squares, cameras, allowed)
         inflation = np.concatenate([camera.inflation for camera in cameras])
@@ -190,16 +194,13 @@ def refine(
             J, r = camera.rows(own[c], 2 * c, unknowns)
             information += J.T @ J
             slope += J.T @ r
-        step = np.asarray(-np.linalg.solve(information, slope), dtype=np.float64)
+        step = np.zeros(unknowns)
+        step[solved] = -np.linalg.solve(information[solved, solved], slope[solved])
         for c, camera in enumerate(cameras):
-            turn = step[2 * c : 2 * c + 2]
-            camera.R = camera.R @ exp_rotation(np.append(turn, 0.0))
-            camera.tilt = camera.tilt + turn
             camera.azimuth = camera.azimuth + step[own[c] : own[c] + K]
-        yaw += float(step[4])
+        yaw += float(step[YAW])
         a = a + step[street : street + K]
-    covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)[:TILTS_AND_YAW, :TILTS_AND_YAW]
-    covariance[range(4), range(4)] += allowed.tilt_rad**2  # shared by all lines, so it does not average out
+    covariance = _covariance(information, [camera.tilt_sigma_rad for camera in cameras])
     return Refined(
         R_vehicle_level=cameras[0].R,
         R_drone_level=cameras[1].R,
@@ -209,6 +210,18 @@ def refine(
         vehicle_lines=round(cameras[0].effective_lines),
         drone_lines=round(cameras[1].effective_lines),
     )
+
+
+def _covariance(information: Array64, tilt_sigma_rad: list[float]) -> Array64:
+    """Covariance (5, 5) of the tilts and the yaw, from the information of all columns without that of the tilts."""
+    P = np.diag(np.repeat(tilt_sigma_rad, 2)) ** 2
+    solution = np.linalg.solve(information[YAW:, YAW:], np.eye(len(information) - YAW, 1))[:, 0]
+    S = -solution @ information[YAW:, :YAW]
+    covariance = np.zeros((TILTS_AND_YAW, TILTS_AND_YAW))
+    covariance[:YAW, :YAW] = P
+    covariance[YAW, :YAW] = covariance[:YAW, YAW] = P @ S
+    covariance[YAW, YAW] = solution[0] + S @ P @ S
+    return covariance
 
 
 def _right_angles(directions: Array64) -> list[tuple[int, int]]:
@@ -221,17 +234,15 @@ def _right_angles(directions: Array64) -> list[tuple[int, int]]:
     ]
 
 
-def _ties(K: int, squares: list[tuple[int, int]], cameras: tuple[_Camera, _Camera], allowed: Tolerances) -> Array64:
-    """J (2 K + squares + 4, unknowns) of the constraints, in sigmas: directions of each camera, right angles, tilts."""
+def _ties(K: int, squares: list[tuple[int, int]], allowed: Tolerances) -> Array64:
+    """J (2 K + squares, unknowns) of the constraints, in sigmas: directions of each camera, right angles."""
     street, own = TILTS_AND_YAW, (TILTS_AND_YAW + K, TILTS_AND_YAW + 2 * K)
-    ties = np.zeros((2 * K + len(squares) + 4, TILTS_AND_YAW + 3 * K))
+    ties = np.zeros((2 * K + len(squares), TILTS_AND_YAW + 3 * K))
     seen = np.arange(K)
-    for c, camera in enumerate(cameras):
+    for c in range(2):
         ties[c * K + seen, own[c] + seen] = 1 / allowed.direction_rad
         ties[c * K + seen, street + seen] = -1 / allowed.direction_rad
-        for axis in range(2):
-            ties[2 * K + len(squares) + 2 * c + axis, 2 * c + axis] = 1 / camera.tilt_sigma_rad
-    ties[K + seen, 4] = 1 / allowed.direction_rad
+    ties[K + seen, YAW] = 1 / allowed.direction_rad
     for row, (i, j) in enumerate(squares, 2 * K):
         ties[row, [street + i, street + j]] = 1 / allowed.square_rad, -1 / allowed.square_rad
     return ties
@@ -246,7 +257,6 @@ def _tie_residuals(
             (cameras[0].azimuth - a) / allowed.direction_rad,
             (cameras[1].azimuth - a + yaw) / allowed.direction_rad,
             [from_square(a[i] - a[j]) / allowed.square_rad for i, j in squares],
-            *(camera.tilt / camera.tilt_sigma_rad for camera in cameras),
         ]
     )
 

@@ -24,6 +24,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stages.geometry.frames import Array64, level_axes
 from stages.kernels.align.spectra import BIN_RAD, BINS, add_kernels
@@ -56,10 +57,37 @@ def level_lines(seen: VanishingDirections, sharpest_rad: float) -> LevelLines | 
     upright = np.flatnonzero(seen.is_vertical)
     if upright.size == 0:
         return None
-    up = seen.direction[upright[0]]
-    R = level_axes(up if up[2] >= 0 else -up)  # the camera mount is never upside down
     chosen = np.flatnonzero(seen.line_direction >= 0)
     chosen = chosen[~seen.is_vertical[seen.line_direction[chosen]]]
+    return _level(seen, seen.direction[upright[0]], float(seen.sigma_rad[upright[0]]), chosen, sharpest_rad)
+
+
+def weighted_lines(seen: VanishingDirections, sharpest_rad: float) -> list[tuple[LevelLines, float]]:
+    """Horizontal lines of each answer of an image, with its probability, as `level_lines`."""
+    if seen.answers is None:
+        lines = level_lines(seen, sharpest_rad)
+        return [] if lines is None else [(lines, 1.0)]
+    answers = seen.answers
+    return [
+        (
+            _level(
+                seen,
+                answers.up[k],
+                float(answers.sigma_rad[k]),
+                np.flatnonzero(answers.line_direction[k] > 0),
+                sharpest_rad,
+            ),
+            probability,
+        )
+        for k, probability in enumerate(answers.probability.tolist())
+    ]
+
+
+def _level(
+    seen: VanishingDirections, up: Array64, tilt_sigma_rad: float, chosen: NDArray[np.int64], sharpest_rad: float
+) -> LevelLines:
+    """The chosen lines (m,) in the level axes of a vertical."""
+    R = level_axes(up if up[2] >= 0 else -up)  # the camera mount is never upside down
     normal = seen.line_normal[chosen] @ R
     flat = np.maximum(np.hypot(normal[:, 0], normal[:, 1]), 1e-6)
     ends = seen.line_end[chosen]
@@ -71,7 +99,7 @@ def level_lines(seen: VanishingDirections, sharpest_rad: float) -> LevelLines | 
     length = np.arccos(np.clip(np.einsum("ni,ni->n", ends[:, 0], ends[:, 1]), -1.0, 1.0))
     return LevelLines(
         R_carrier_level=R,
-        tilt_sigma_rad=float(seen.sigma_rad[upright[0]]),
+        tilt_sigma_rad=tilt_sigma_rad,
         normal=normal,
         sigma_rad=sigma,
         azimuth_rad=np.arctan2(h[:, 1], h[:, 0]) % math.pi,

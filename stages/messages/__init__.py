@@ -22,6 +22,7 @@ from stages.messages.cameras import FollowedFeatures as FollowedFeatures
 from stages.messages.cameras import RelativeRotation as RelativeRotation
 from stages.messages.cameras import VanishingDirections as VanishingDirections
 from stages.messages.cameras import VisualMotion as VisualMotion
+from stages.messages.cameras import WeightedAnswers as WeightedAnswers
 from stages.messages.cues import CueFactor as CueFactor
 from stages.messages.cues import CueKind as CueKind
 from stages.messages.cues import CueState as CueState

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
@@ -18,12 +19,23 @@ class CameraMount(enum.Enum):
     DRONE = "drone"
 
 
-@message(schema=41)
+@dataclass(frozen=True, slots=True)
+class WeightedAnswers:
+    """Answers that fit the lines of an image about equally well, best first: a vertical and a horizontal pair each."""
+
+    up: Annotated[NDArray[np.float64], Shape("a", 3)]  # (a, 3) unit vector, axes of the mount
+    sigma_rad: Annotated[NDArray[np.float64], Shape("a")]  # (a,) of the vertical, per axis
+    probability: Annotated[NDArray[np.float64], Shape("a")]  # (a,) their sum is 1
+    # (a, m) of each line in each answer: 0 along the vertical, 1 and 2 along the horizontal pair; -1: none
+    line_direction: Annotated[NDArray[np.int64], Shape("a", "m")]
+
+
+@message(schema=118)
 class VanishingDirections(Message):
     """Vanishing directions of one image and the lines that support them; stamp_ns is the image's. P IV, V.C.
 
     Axes are those of `camera_mount` (x forward, y left, z up), not of the lens. The sign of a direction is arbitrary.
-    A message without directions is normal: `reason` states why.
+    A message without directions is normal: `reason` states why. It may have several weighted answers instead.
     """
 
     camera_mount: CameraMount
@@ -37,6 +49,7 @@ class VanishingDirections(Message):
     line_sigma_rad: Annotated[NDArray[np.float64], Shape("m")]
     line_direction: Annotated[NDArray[np.int64], Shape("m")]  # (m,) index of its direction; -1: none
     reason: str
+    answers: WeightedAnswers | None = None  # where the image has no single answer; there are no directions then
 
 
 class BranchState(enum.Enum):

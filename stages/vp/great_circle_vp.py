@@ -6,7 +6,8 @@
 On the drone, gravity is the autopilot's tilt. Without it, gravity is the mount's z axis within
 `vertical_sigma_deg`, which is correct for a vehicle. With a rolling shutter (`readout_ms` of the camera link), each
 point is corrected to the exposure of the middle row with the angular rate of the mount: `tilt` on the drone,
-`motion` on the vehicle. An image without enough straight lines gives no directions, and a reason.
+`motion` on the vehicle. An image without enough straight lines gives no directions, and a reason; one whose lines fit
+several verticals about equally well gives each as an answer with a probability, for `align` and the heading.
 
 The scores of further pairs and the least and weak sigma were chosen on renders of three real panoramas; a fourth was
 kept back: tests/benchmarks/accuracy/bench_vp_panoramas.py. A weak pair, of which one in five is false there, serves
@@ -172,4 +173,5 @@ class GreatCircleVp(Stage[GreatCircleVpSettings]):
             line_sigma_rad=sigma_rad,
             line_direction=found.line_direction,
             reason=found.reason,
+            answers=found.answers,
         )

@@ -8,7 +8,7 @@ Source: ours, for P IV.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 from stages.geometry.lens import Array64
 from stages.kernels.vp.directions import PARTS, all_directions, parts_of, upright, without
 from stages.kernels.vp.spectrum import APART_RAD
+from stages.messages import WeightedAnswers
 from stages.vp.directions import Lines, Structure, assign, jackknife, refine, residual_sigma
+from stages.vp.rivals import Rivals, compare
 from stages.vp.spectrum import pair_support, peaks, wrap_90deg, yaw_spectrum
 from stages.vp.verticals import propose_verticals, refine_vertical
 
@@ -27,8 +29,6 @@ FURTHER_SCORE = 1.5  # added to `min_score` for further pairs
 PEAKS = 3  # highest peaks of the yaw spectrum to refine for the first pair
 DUPLICATE_RAD = math.radians(1.0)  # refined verticals nearer than this are one
 TRIAL_ITERATIONS = 4
-RIVAL_RAD = math.radians(3.0)  # a vertical farther than this from the best one is a rival
-RIVAL_SHARE = 0.85  # a rival with more than this share of the best agreement makes the result ambiguous
 MIN_DIRECTION_LINES = 2  # of a horizontal direction
 MAX_REJECTED = 3  # further pairs that are tried in vain
 
@@ -68,10 +68,11 @@ class FoundDirections:
     frame: NDArray[np.int64]
     line_direction: NDArray[np.int64]
     reason: str
+    answers: WeightedAnswers | None = None
 
 
 def find_structure(lines: Lines, prior: VerticalPrior, limits: SearchLimits) -> FoundDirections:
-    """The best upright structure of the lines, or no direction and the reason."""
+    """The best upright structure of the lines; or several with weights; or no direction and the reason."""
     m = len(lines.normal)
     if m < limits.min_lines:
         return _no_directions(m, f"too few straight lines: {m}")
@@ -85,30 +86,30 @@ def find_structure(lines: Lines, prior: VerticalPrior, limits: SearchLimits) -> 
         v = refine_vertical(lines, start, prior.up, prior.sigma_rad, limits.sigma_model, gate)
         if all(abs(float(v @ other)) < math.cos(DUPLICATE_RAD) for other in verticals):
             verticals.append(v)
-    pairs = sorted((_best_pair(lines, v, prior, limits) for v in verticals), key=lambda p: -p.agreement)
-    for other in pairs[1:]:
-        is_rival = abs(float(other.axes[:, 2] @ pairs[0].axes[:, 2])) < math.cos(RIVAL_RAD)
-        if is_rival and other.agreement > RIVAL_SHARE * pairs[0].agreement:
-            return _no_directions(m, "ambiguous: two verticals fit the lines about equally well; connect an attitude")
+    pairs = sorted((p for v in verticals for p in _pairs(lines, v, prior, limits)), key=lambda p: -p.agreement)
     yaws, confident, peak = _frames(lines, pairs[0].axes, limits)
     if not yaws:
         vertical = verticals[0] if len(verticals) == 1 else pairs[0].axes[:, 2]
         return _vertical_only(lines, vertical, prior, limits, peak)
-    structure = refine(lines, pairs[0].axes, np.array(yaws), prior.up, prior.sigma_rad, limits.sigma_model)
-    return _directions_of(lines, structure, confident, limits)
+    given = prior.up, prior.sigma_rad, limits.sigma_model
+    structure = refine(lines, pairs[0].axes, np.array(yaws), *given)
+    rivals = compare(lines, structure.axes, [pair.axes for pair in pairs], limits.sigma_model)
+    if rivals.answers:  # best first
+        others = [refine(lines, pairs[k].axes, np.zeros(1), *given) for k, _ in rivals.answers]
+        return _ambiguous(lines, [structure, *others], [1.0, *(weight for _, weight in rivals.answers)], limits)
+    return _directions_of(lines, structure, confident, rivals, limits)
 
 
-def _best_pair(lines: Lines, vertical: Array64, prior: VerticalPrior, limits: SearchLimits) -> Structure:
-    """The vertical and one horizontal pair, refined from each of the highest peaks of the spectrum; the best one."""
+def _pairs(lines: Lines, vertical: Array64, prior: VerticalPrior, limits: SearchLimits) -> list[Structure]:
+    """The vertical and one horizontal pair, refined from each of the highest peaks of the spectrum."""
     axes = upright(vertical)
     spectrum = yaw_spectrum(lines, axes, ~_along_vertical(lines, vertical, limits), limits.sigma_model, BINS)
-    found = [
+    return [
         refine(
             lines, axes @ _about_z(yaw), np.zeros(1), prior.up, prior.sigma_rad, limits.sigma_model, TRIAL_ITERATIONS
         )
         for yaw in peaks(spectrum, PEAKS)
     ]
-    return max(found, key=lambda s: s.agreement)
 
 
 def _along_vertical(lines: Lines, vertical: Array64, limits: SearchLimits) -> NDArray[np.bool_]:
@@ -158,12 +159,20 @@ def _near(lines: Lines, axes: Array64, yaw: float, limits: SearchLimits) -> NDAr
     return assign(lines, directions, 2.0 * limits.sigma_model)[0] >= 0
 
 
-def _directions_of(lines: Lines, s: Structure, confident: list[bool], limits: SearchLimits) -> FoundDirections:
-    """The directions that have lines; sigmas by the larger of information matrix and jackknife, with `least_sigma`."""
+def _directions_of(
+    lines: Lines, s: Structure, confident: list[bool], rivals: Rivals, limits: SearchLimits
+) -> FoundDirections:
+    """The directions that have lines.
+
+    Sigmas by the larger of information matrix and jackknife, with the rivals and `least_sigma`.
+    """
     directions = all_directions(s.axes, s.yaw_rad)
     counts = np.bincount(s.assigned[s.assigned >= 0], minlength=len(directions))
     cov: Array64 = np.linalg.inv(s.information).astype(np.float64) * max(s.scatter, limits.least_scatter) ** 2
-    sigma = _sigmas(np.array([cov, jackknife(lines, s, limits.sigma_model)]), directions @ s.axes)
+    local = directions @ s.axes
+    sigma = np.hypot(
+        _sigmas(np.array([cov, jackknife(lines, s, limits.sigma_model)]), local), np.sqrt(rivals.variance_rad2(local))
+    )
     rows: list[Array64] = []
     sigmas: list[float] = []
     frames: list[int] = []
@@ -176,7 +185,9 @@ def _directions_of(lines: Lines, s: Structure, confident: list[bool], limits: Se
         number[k] = len(rows)
         rows.append(d)
         frames.append(f)
-        sigmas.append(math.hypot(sigma[k], limits.least_sigma, 0.0 if f < 0 or confident[f] else limits.weak_sigma))
+        sigmas.append(
+            math.hypot(float(sigma[k]), limits.least_sigma, 0.0 if f < 0 or confident[f] else limits.weak_sigma)
+        )
     line_direction = np.where(s.assigned >= 0, number[s.assigned], -1)
     if not rows:
         return _no_directions(len(lines.normal), "no direction has enough lines after refinement")
@@ -225,6 +236,24 @@ def _vertical_only(
         return _no_directions(len(near), f"{reason}; parts of the upright lines disagree")
     none = np.array([-1], dtype=np.int64)
     return FoundDirections(v[None], np.array([sigma]), none, np.where(near, 0, -1).astype(np.int64), reason)
+
+
+def _ambiguous(lines: Lines, found: list[Structure], weights: list[float], limits: SearchLimits) -> FoundDirections:
+    """No single answer: structures with their weights, each with its vertical and its first horizontal pair."""
+    z = np.array([[0.0, 0.0, 1.0]])
+    sigmas: list[float] = []
+    for s in found:
+        cov: Array64 = np.linalg.inv(s.information).astype(np.float64) * max(s.scatter, limits.least_scatter) ** 2
+        (sigma,) = _sigmas(np.array([cov, jackknife(lines, s, limits.sigma_model)]), z)
+        sigmas.append(math.hypot(sigma, limits.least_sigma))
+    answers = WeightedAnswers(
+        up=np.array([s.axes[:, 2] for s in found]),
+        sigma_rad=np.array(sigmas),
+        probability=np.array(weights) / sum(weights),
+        line_direction=np.array([np.where(s.assigned < 3, s.assigned, -1) for s in found], dtype=np.int64),
+    )
+    reason = f"ambiguous: {len(found)} verticals fit the lines about equally well; connect an attitude"
+    return replace(_no_directions(len(lines.normal), reason), answers=answers)
 
 
 def _no_directions(m: int, reason: str) -> FoundDirections:

@@ -33,7 +33,6 @@ LONGEST_STEP_S = 1.0  # between two images; after a longer gap no rotation is pr
 class LinkSettings(StrictModel):
     """Thresholds for a new key image, noise of a track, errors that tracks share, limit of hypotheses.
 
-    `correlation`: chosen so that the NEES from key to key on KITTI 00 is about 3 (2.6); too large on panoramas (0.4).
     `lens_share` is a calibration error of 0.3 px at 300 px from the centre.
     """
 
@@ -42,7 +41,6 @@ class LinkSettings(StrictModel):
     key_age_s: float = Field(default=5.0, gt=0, le=60)
     least_noise_px: float = Field(default=0.05, gt=0, le=2)  # minimum, of one track, at the image centre
     shared_noise_px: float = Field(default=0.01, ge=0, le=2)  # common to all tracks, whatever the motion
-    correlation: float = Field(default=1.65, ge=1, le=10)  # of neighbouring tracks: actual over independent sigma
     lens_share: float = Field(default=0.001, ge=0, le=0.1)  # error of the lens, as a share of the rotation
     parallax_share: float = Field(default=0.025, ge=0, le=0.5)  # error of the rotation, as a share of the parallax
     direction_sigma_deg: float = Field(default=0.5, ge=0, le=10)  # error of the direction that all tracks share
@@ -74,7 +72,6 @@ class MotionLinks:
         self._noise = Noise(
             settings.least_noise_px * pixel,
             settings.shared_noise_px * pixel,
-            settings.correlation,
             settings.lens_share,
             settings.parallax_share,
             math.radians(settings.direction_sigma_deg),

@@ -66,7 +66,6 @@ class Noise:
 
     least_rad: float  # minimum, independent per track
     shared_rad: float  # common to all tracks: it does not average out
-    correlation: float = 1.0  # actual over independent sigma of a motion: errors of neighbouring tracks are alike
     lens_share: float = 0.0  # common error of the lens, as a share of the rotation
     parallax_share: float = 0.0  # common error of the rotation by parallax, as a share: moving things, warped templates
     direction_rad: float = 0.0  # common error of the direction of translation
@@ -150,7 +149,7 @@ def relative_motion(
     parallax = float(np.median(separation[clearly])) if clearly.any() else 1e-9
     B = np.zeros((6, 5))
     B[:3, :3], B[3:, 3:] = np.eye(3), across(t)
-    covariance = B @ np.linalg.inv(information) @ B.T * (noise.correlation * sigma) ** 2
+    covariance = B @ np.linalg.inv(information) @ B.T * sigma**2
     angle = float(np.linalg.norm(log_rotation(rotation)))
     covariance[:3, :3] += noise.rotation_variance_rad2(angle, parallax) * np.eye(3)
     covariance[3:, 3:] += noise.direction_variance_rad2(angle, parallax) * (np.eye(3) - np.outer(t, t))
@@ -190,7 +189,7 @@ def _pure_rotation(earlier: Array64, later: Array64, R_guess: Array64, noise: No
     H = (len(y) * np.eye(3) - y.T @ y) / 2.0  # both rays are noisy
     covariance = np.zeros((6, 6))
     angle = float(np.linalg.norm(log_rotation(rotation)))
-    covariance[:3, :3] = np.linalg.inv(H) * (noise.correlation * sigma) ** 2
+    covariance[:3, :3] = np.linalg.inv(H) * sigma**2
     covariance[:3, :3] += noise.rotation_variance_rad2(angle, 0.0) * np.eye(3)
     return TwoView(rotation, None, covariance, inlier, sigma, 0, 0.0)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -12,8 +13,18 @@ from flow.stage import input_ports, output_ports
 from stages.align.joint_align import JointAlign
 from stages.align.refine import Tolerances, refine
 from stages.align.spectra import level_lines
+from stages.heading.bank_measurements import add_vertical
+from stages.heading.inertial_bank import start
+from stages.heading.rotation_matches import RotationMatches, add_matches
 from stages.kernels.geometry.so3 import exp_rotation, log_rotation
-from stages.messages import BranchState, CameraMount, RelativeRotation, VanishingDirections, VehicleMotion
+from stages.messages import (
+    BranchState,
+    CameraMount,
+    RelativeRotation,
+    VanishingDirections,
+    VehicleMotion,
+    WeightedAnswers,
+)
 from tests.stages.align.made_lines import ATLANTA, CAMPUS, MS, nothing, seen, turned
 
 VEHICLE_AND_DRONE = (CameraMount.VEHICLE, (70.0,)), (CameraMount.DRONE, (0.0,))
@@ -72,6 +83,48 @@ def test_a_street_that_may_be_either_of_two_gives_both_matches():
     assert np.all(np.diff(output.probabilities) <= 0)
 
 
+def with_two_answers(image: VanishingDirections, other_up, probabilities=(0.4, 0.6)) -> VanishingDirections:
+    """The image without a single answer: the true vertical, or another one with the lines of the same streets."""
+    owner = np.where(image.line_direction > 2, -1, image.line_direction)
+    answers = WeightedAnswers(
+        up=np.array([image.direction[0], other_up]),
+        sigma_rad=np.full(2, 0.004),
+        probability=np.array(probabilities),
+        line_direction=np.array([owner, owner]),
+    )
+    return dataclasses.replace(
+        nothing(image.camera_mount),
+        line_normal=image.line_normal,
+        line_end=image.line_end,
+        line_sigma_rad=image.line_sigma_rad,
+        line_direction=np.full(len(owner), -1),
+        answers=answers,
+    )
+
+
+def test_an_image_with_two_answers_gives_the_matches_of_both_and_the_level_of_the_drone_selects_one():
+    R_v, R_d = turned(0, 0, 30), turned(0, 0, 251)
+    other_up = turned(9, -7, 0)[:, 2]
+    drone = with_two_answers(seen(CameraMount.DRONE, R_d), other_up)
+    check_arrays(drone)
+    output = pair(seen(CameraMount.VEHICLE, R_v), drone)
+    check_arrays(output)
+    off = np.array([off_deg(R_v.T @ R_d, R) for R in output.rotations])
+    right = off < 1.0
+    assert right.any()
+    assert (off > 5.0).any()
+    assert output.probabilities[right].sum() == pytest.approx(0.4, abs=0.1)
+    assert output.probabilities.sum() < 1.0
+    up = np.array([0.0, 0.0, 1.0])
+    bank = start(np.zeros(3), 0.01 * np.eye(3), None, up)
+    for _ in range(3):
+        add_vertical(bank, up, math.radians(2.0))  # gravity, as the heading knows it from its IMU
+    add_matches(bank, RotationMatches(output.rotations, output.covariances_rad2, output.probabilities, np.eye(3)), 1.0)
+    assert bank.tied.any()
+    for R in bank.state.R[bank.tied]:
+        assert off_deg(R_v.T @ R_d, R) < 3.0
+
+
 def test_the_tilt_covariance_includes_errors_of_mount_and_lens():
     """NEES of both tilts over 150 rigs: mount errors of 0.05 deg and lens centre errors of 0.15 px at 720 px, 175 px per radian."""
     rng = np.random.default_rng(11)
@@ -81,8 +134,8 @@ def test_the_tilt_covariance_includes_errors_of_mount_and_lens():
     for seed in range(150):
         off_v, off_d = exp_rotation(rng.normal(0, off_rad)), exp_rotation(rng.normal(0, off_rad))
         match = pair(
-            seen(CameraMount.VEHICLE, R_vehicle @ off_v, ATLANTA, seed=seed),
-            seen(CameraMount.DRONE, R_drone @ off_d, ATLANTA, seed=seed),
+            seen(CameraMount.VEHICLE, R_vehicle @ off_v, ATLANTA, up_error_rad=0.004, seed=seed),
+            seen(CameraMount.DRONE, R_drone @ off_d, ATLANTA, up_error_rad=0.004, seed=seed),
             tilt_sigma_deg=0.07,
         )
         branches = (turned(0, 0, 25 + quarter).T @ match.R_vehicle_drone for quarter in (0, 90, 180, 270))

@@ -45,20 +45,17 @@ def test_perfect_lines_give_the_rotation_also_of_tilted_carriers(streets, yaw_de
     np.testing.assert_allclose(phi, 0.0, atol=1e-5)
 
 
-def test_a_wrong_vertical_is_corrected_by_the_streets():
-    """All horizontal lines together determine the vertical."""
+def test_the_tilt_is_that_of_the_images_with_its_sigma_and_its_effect_on_the_yaw():
+    """The lines have determined the verticals before: they give no more of them here."""
     R_v, R_d = turned(0, 0, 0), turned(0, 0, 31)
-    off = [
-        np.linalg.norm(
-            error(
-                aligned(R_v, R_d, per_direction=60, sigma_rad=1e-4, up_error_rad=0.02, up_sigma_rad=sigma, seed=2),
-                R_v,
-                R_d,
-            )[0]
-        )
-        for sigma in (0.02, 1e-5)
-    ]
-    assert off[0] < 0.25 * off[1]
+    options = {"per_direction": 60, "sigma_rad": 1e-4, "up_error_rad": 0.02, "seed": 2}
+    refined = aligned(R_v, R_d, up_sigma_rad=0.02, **options)
+    images = [seen(mount, R, **options) for mount, R in ((CameraMount.VEHICLE, R_v), (CameraMount.DRONE, R_d))]
+    for image, R_level in zip(images, (refined.R_vehicle_level, refined.R_drone_level), strict=True):
+        np.testing.assert_allclose(R_level[:, 2], image.direction[0], atol=1e-12)
+    np.testing.assert_allclose(refined.covariance[:4, :4], 0.02**2 * np.eye(4), atol=1e-12)
+    exact = aligned(R_v, R_d, up_sigma_rad=1e-6, **options)
+    assert refined.yaw_sigma_rad > 1.2 * exact.yaw_sigma_rad
 
 
 def test_turning_the_world_changes_nothing():

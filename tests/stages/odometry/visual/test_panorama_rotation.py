@@ -19,11 +19,11 @@ STEP_NS = 100_000_000
 
 
 @pytest.mark.parametrize("name", ["112351", "112379"])
-def test_the_rotation_of_a_turning_camera_is_not_overconfident_and_has_no_translation(name):
+def test_the_rotation_of_a_turning_camera_is_as_uncertain_as_stated_and_has_no_translation(name):
+    """The renders have an exact lens, so that no error is common to all tracks."""
     rng = np.random.default_rng(int(name))
-    odometry = FisheyeOdometry(
-        lens=fisheye(), T_drone_camera=Pose(rpy_deg=(180.0, 0.0, -90.0)), link={"lens_share": 0.0}
-    )
+    exact = {"lens_share": 0.0, "shared_noise_px": 0.0}
+    odometry = FisheyeOdometry(lens=fisheye(), T_drone_camera=Pose(rpy_deg=(180.0, 0.0, -90.0)), link=exact)
     R, turn, rotations, nees = np.eye(3), np.zeros(3), [], []
     for i in range(10):
         turn = 0.8 * turn + rng.normal(0.0, math.radians(0.8), 3)
@@ -40,7 +40,7 @@ def test_the_rotation_of_a_turning_camera_is_not_overconfident_and_has_no_transl
         assert motion.direction_from is None
         nees.append(error @ np.linalg.solve(motion.covariance_rad2, error))
     print(f"NEES of 3: {np.mean(nees):.1f}")  # noqa: T201
-    assert np.mean(nees) < 3.0
+    assert 1.0 < np.mean(nees) < 5.0
 
 
 def rolled(name, R, rate_radps, readout_s):

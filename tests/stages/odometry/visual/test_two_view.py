@@ -145,12 +145,6 @@ def test_the_common_error_of_lens_and_parallax_grows_with_the_motion():
     assert found.direction_sigma_rad == pytest.approx(0.02, rel=0.1)
 
 
-def test_correlated_errors_of_neighbours_scale_the_covariance():
-    earlier, later, _, _ = point_rays(100, TURN, MOVE, noise_rad=5e-4)
-    one, alike = (motion(earlier, later, noise=Noise(1e-4, 0.0, correlation=c)).covariance for c in (1.0, 2.0))
-    np.testing.assert_allclose(alike, 4.0 * one)
-
-
 def test_too_few_points_or_no_agreement_is_none():
     earlier, later, _, _ = point_rays(11, TURN, MOVE)
     assert motion(earlier, later) is None

@@ -31,7 +31,10 @@ NOT_DISPLACED_NATS = 3.0  # cap of the log ratio over a static object that may s
 
 
 class Feature(NamedTuple):
-    """A feature: `monotone` +1 or -1, whether it makes a drone more or less probable by physics; 0 for the range, which no model uses."""
+    """A feature: `monotone` +1 or -1, whether it makes a drone more or less probable by physics.
+
+    0 for the range, which no model uses.
+    """
 
     name: str
     monotone: int

@@ -4,8 +4,8 @@
 
 o_k are the log-odds of a drone over alternative k: a false return, a static object, a bird, a balloon. Each g_kj is a
 piecewise linear function of one feature, given by its values at knots, constant beyond the first and the last one, and
-monotone where `features.py` says so. A missing feature (NaN) adds `missing`. A drone must be more probable than every alternative, so the evidence against one of them never replaces
-that against another.
+monotone where `features.py` says so. A missing feature (NaN) adds `missing`. A drone must be more probable than every
+alternative, so the evidence against one of them never replaces that against another.
 
 `grd train-detector` writes the file (links/training); its command, data and scores are in it.
 

@@ -63,8 +63,9 @@ class Edge:
 
 
 def default_queue(message: type[Message]) -> QueueSettings:
-    """`latest` for an image (an array with two free dimensions): it is large, and an old one is useless; else DEPTH."""
-    is_image = any(sum(isinstance(d, str) for d in shape.dims) > 1 for _, _, shape in array_fields(message))
+    """`latest` for an image (a field with two free dimensions): it is large, and an old one is useless; else DEPTH."""
+    own = (shape for name, _, shape in array_fields(message) if "." not in name)  # not of a dataclass in a field
+    is_image = any(sum(isinstance(d, str) for d in shape.dims) > 1 for shape in own)
     return QueueSettings("latest", 1) if is_image else QueueSettings("drop_oldest", DEPTH)
 
 

@@ -42,5 +42,5 @@ def value_of(hint: Any, sizes: dict[str, int]) -> st.SearchStrategy[Any]:
 @st.composite
 def messages(draw: Any, cls: type[Message]) -> Message:
     hints = get_type_hints(cls, include_extras=True)
-    letters = {letter: draw(st.integers(0, 4)) for letter in ("n", "m", "k", "h", "w", "lasers")}
+    letters = {letter: draw(st.integers(0, 4)) for letter in ("n", "m", "k", "a", "h", "w", "lasers")}
     return cls(**{field.name: draw(value_of(hints[field.name], letters)) for field in fields(cls)})

@@ -168,11 +168,8 @@ def _directions_of(
     """
     directions = all_directions(s.axes, s.yaw_rad)
     counts = np.bincount(s.assigned[s.assigned >= 0], minlength=len(directions))
-    cov: Array64 = np.linalg.inv(s.information).astype(np.float64) * max(s.scatter, limits.least_scatter) ** 2
     local = directions @ s.axes
-    sigma = np.hypot(
-        _sigmas(np.array([cov, jackknife(lines, s, limits.sigma_model)]), local), np.sqrt(rivals.variance_rad2(local))
-    )
+    sigma = np.hypot(_sigmas_of(lines, s, local, limits), np.sqrt(rivals.variance_rad2(local)))
     rows: list[Array64] = []
     sigmas: list[float] = []
     frames: list[int] = []
@@ -196,6 +193,12 @@ def _directions_of(
     which = f" ({weak} weak)" if weak else ""
     reason = f"{pairs} horizontal frame{'s' if pairs != 1 else ''}{which}, {int((line_direction >= 0).sum())} lines"
     return FoundDirections(np.array(rows), np.array(sigmas), np.array(frames, dtype=np.int64), line_direction, reason)
+
+
+def _sigmas_of(lines: Lines, s: Structure, local: Array64, limits: SearchLimits) -> list[float]:
+    """Sigma per axis of directions (k, 3) in the axes of a structure, by its residuals or a jackknife."""
+    cov: Array64 = np.linalg.inv(s.information).astype(np.float64) * max(s.scatter, limits.least_scatter) ** 2
+    return _sigmas(np.array([cov, jackknife(lines, s, limits.sigma_model)]), local)
 
 
 def _sigmas(cov: Array64, local: Array64) -> list[float]:
@@ -243,8 +246,7 @@ def _ambiguous(lines: Lines, found: list[Structure], weights: list[float], limit
     z = np.array([[0.0, 0.0, 1.0]])
     sigmas: list[float] = []
     for s in found:
-        cov: Array64 = np.linalg.inv(s.information).astype(np.float64) * max(s.scatter, limits.least_scatter) ** 2
-        (sigma,) = _sigmas(np.array([cov, jackknife(lines, s, limits.sigma_model)]), z)
+        (sigma,) = _sigmas_of(lines, s, z, limits)
         sigmas.append(math.hypot(sigma, limits.least_sigma))
     answers = WeightedAnswers(
         up=np.array([s.axes[:, 2] for s in found]),

@@ -3,8 +3,8 @@
 Penalised maximum likelihood over the values at the knots, which are quantiles of the training data. The penalty pulls
 to the prior knowledge: log likelihood ratios of the telemetry count as they are, in part, since their observations err
 together; everything else counts nothing until the data show it. Its strength is chosen by the log loss on flights that
-were left out, since the rows of one flight are not independent. No function of the range is fitted: it would be that
-of the ranges at which the training flights have drones.
+were left out, since the rows of one flight are not independent. The range is not used: its effect would be that of the
+ranges at which the training flights have drones.
 
 Source: grd; Wood, Generalized Additive Models (2017), 5.3 (penalised linear splines); SciPy's L-BFGS-B.
 """
@@ -41,24 +41,23 @@ PRIOR_PENALTY = 0.02  # assumed; of the priors, relative to the other parameters
 STRENGTHS = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0)  # of the penalty
 FOLDS = 5
 EASY_SHARE = 0.05  # assumed; of the single observations without telemetry that are used; they are most of all rows
-OF_FLIERS = (  # of size and open air around it: against a bird or balloon, too
+OF_FLIERS = (  # size, and open air around it: tell a drone from a bird or balloon, too
     "return_ratio", "return_count_nats", "free_sectors", "least_free", "isolated_score", "neighbour_score",
 )  # fmt: skip
 USED: tuple[tuple[str, ...], ...] = (  # features of each alternative
     (
-        "existence_nats", "false_per_s", "scan_passes", "first_returns", "return_ratio", "passed_pulses",
-        "missed_returns", "neighbour_score",
+        "existence_nats", "false_per_s", "scan_passes", "first_returns", "return_ratio", "neighbour_score",
     ),
     (
         "scan_passes", "return_count_nats", "free_sectors", "least_free", "neighbour_score", "isolated_score",
-        "large_object_m", "large_object_share", "too_long_passes", "straight_sigmas", "moves", "near_rejected",
+        "large_object_m", "large_object_share", "too_long_share", "straight_sigmas", "moves", "near_rejected",
         "revisited", "displaced_nats", "passes_since_reacquired", "imu_over_static_nats",
     ),
     (
         *OF_FLIERS, "top_mps", "relative_speed_mps", "acceleration_mps2", "fastest_mps", "hardest_mps2", "calm_s",
         "over_bird_nats", "imu_over_bird_nats",
     ),
-    (*OF_FLIERS, "round_chords", "rough_chords", "straight_mps", "over_balloon_nats", "imu_over_balloon_nats"),
+    (*OF_FLIERS, "rough_share", "straight_mps", "over_balloon_nats", "imu_over_balloon_nats"),
 )  # fmt: skip
 
 

@@ -77,7 +77,6 @@ class Candidate:
     missed_returns: float = 0.0  # expected returns that did not come
     existence_nats: float = 0.0  # log-odds that one object causes its observations, see trained/existence.py
     false_per_s: float = LEAST_FALSE_PER_S  # rate of false returns at its range, at its last observation
-    passed_pulses: float = 0.0  # pulses through its middle in scan passes without a return
     observations: int = 0
     features: Array64 = field(default_factory=lambda: np.zeros(0))  # at its newest classification
     returns: int = 0

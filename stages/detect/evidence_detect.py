@@ -354,7 +354,6 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
             watch = now.watches.get(c.number)
             if watch is not None and now_ns - watch.stamp_ns > SAME_PASS_NS:
                 if watch.returns == 0 and now_ns - c.seen_ns > 2 * SAME_PASS_NS:
-                    c.passed_pulses += watch.pass_throughs
                     c.existence_nats += passed_nats(c.range_m, watch.pass_throughs)
                     c.missed_returns += watch.pass_throughs * range_share(c.range_m)
                     self._classify(now, c)

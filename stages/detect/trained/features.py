@@ -4,7 +4,8 @@
 observations for a speed) is NaN. VERSION changes with the list or the meaning of a feature.
 
 Each that a model uses is monotone: what has no sign by physics, as the range, climb or age of a candidate, tells more
-of the flights of a simulator than of the candidate. The range is logged only.
+of the flights of a simulator than of the candidate. The range is logged only. No sum over a candidate's history counts
+against a drone: it would grow with the length of the flight.
 
 Features depend on the classifier of the run, which decides which candidates are kept and counted. Train on replays with
 the classifier that the model replaces, then again on replays with the model.
@@ -24,7 +25,7 @@ from stages.detect.flight import Motion, straight_flight
 from stages.detect.motion_log_ratios import MotionLogRatios
 from stages.geometry.frames import Array64
 
-VERSION = 6
+VERSION = 7
 PULSE_RAD = math.radians(0.2)  # between two pulses of a laser: VLP-16, 600 rpm
 NONE_M = 4.0  # written where no large object is near
 NOT_DISPLACED_NATS = 3.0  # cap of the log ratio over a static object that may seem to move as far
@@ -50,17 +51,14 @@ FEATURES: tuple[Feature, ...] = (
     Feature("first_returns", 1, "returns of the first scan pass", "returns"),
     Feature("return_ratio", 1, "returns over those of a beam across the drone", "returns"),
     Feature("return_count_nats", 1, "returns of each scan pass, as a drone's and not a wire's", "returns"),
-    Feature("passed_pulses", -1, "pulses that passed through its middle", "existence"),
-    Feature("missed_returns", -1, "returns expected of these pulses", "existence"),
     Feature("free_sectors", 1, "sectors around it that pulses flew through", "surroundings"),
     Feature("least_free", 1, "scan passes in which its least observed sector was free", "surroundings"),
     Feature("neighbour_score", -1, "objects next to it", "surroundings"),
     Feature("isolated_score", 1, "recent scan passes without a neighbour", "surroundings"),
     Feature("large_object_m", 1, "distance to a wall, crown or trunk", "surroundings"),
     Feature("large_object_share", -1, "share of scan passes next to a large object", "surroundings"),
-    Feature("too_long_passes", -1, "scan passes in which it was longer than the drone", "shape"),
-    Feature("round_chords", -1, "smooth, round chords", "shape"),
-    Feature("rough_chords", 1, "chords that are not smooth", "shape"),
+    Feature("too_long_share", -1, "share of scan passes in which it was longer than the drone", "shape"),
+    Feature("rough_share", 1, "share of chords that are not smooth and round", "shape"),
     Feature("relative_speed_mps", -1, "speed relative to the vehicle", "motion"),
     Feature("acceleration_mps2", -1, "acceleration", "motion"),
     Feature("fastest_mps", -1, "highest speed that it significantly had", "motion"),
@@ -111,17 +109,14 @@ def features_of(c: Candidate, span_m: float, motion_known: bool) -> Array64:
             c.first_returns,
             c.returns / c.observations * PULSE_RAD * c.range_m / span_m,
             c.return_count_nats,
-            c.passed_pulses,
-            c.missed_returns,
             np.count_nonzero(c.free >= 1.0),
             c.free.min(),
             c.neighbour_score,
             c.isolated_score,
             min(c.large_object_m, NONE_M),
             c.large_object_passes / c.observations,
-            c.too_long_passes,
-            c.round_chords,
-            c.rough_chords,
+            min(c.too_long_passes / passes, 1.0),
+            (c.rough_chords + 1.0) / (c.round_chords + c.rough_chords + 2.0),  # by Laplace's rule of succession
             slower.speed_mps,
             m.acceleration_mps2,
             c.fastest_mps,

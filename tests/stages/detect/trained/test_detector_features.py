@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -44,6 +45,16 @@ def test_returns_are_relative_to_those_of_a_beam_across_the_drone():
     assert features["return_ratio"] == pytest.approx(4 * 20.0 * PULSE_RAD / 0.5)
     one, two = observation(0.0, returns=1, range_m=20.0), observation(0.1, returns=3, range_m=20.0)
     assert named(candidate(one, two))["return_ratio"] == pytest.approx(2 * 20.0 * PULSE_RAD / 0.5)
+
+
+def test_shares_of_chords_and_of_long_passes_do_not_grow_with_the_length_of_a_flight():
+    chords = [{"round_chords": 1}, {"rough_chords": 3}, {"rough_chords": 2, "too_long": True}, {}]
+    short, long = (
+        named(candidate(*(replace(observation(0.1 * k), **chords[k % 4]) for k in range(count)))) for count in (40, 400)
+    )
+    for name, limit in (("rough_share", 5 / 6), ("too_long_share", 1 / 4)):
+        assert short[name] == pytest.approx(limit, abs=0.04)
+        assert long[name] == pytest.approx(limit, abs=0.01)
 
 
 def test_a_straight_flight_has_its_speed_in_any_direction():

@@ -118,7 +118,7 @@ class Candidate:
     # positions in the map frame [m] at which a neighbour was measured, each with its faded weight
     neighbours: list[tuple[Array64, float]] = field(default_factory=lambda: list[tuple[Array64, float]]())
     log_ratios: MotionLogRatios | None = None  # newest comparison of its path with telemetry; None: none yet
-    imu_log_ratios: MotionLogRatios | None = None  # the same by its IMU alone; None: no IMU
+    imu_log_ratios: MotionLogRatios | None = None  # the same by its IMU alone; None: no IMU, or telemetry
     flight_log_ratio: float = 0.0  # highest log ratio over a static object or wire reached in open air [nats]
 
     def predict_as_drone(self, stamp_ns: int, expected_mps: Array64, spread_mps: float) -> tuple[Array64, Array64]:

@@ -286,8 +286,10 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
         """Classify a candidate again. True: publish a change."""
         settings = self.settings
         motion_known = self._motion_known(c.seen_ns)
-        c.add_log_ratios(now.telemetry.of(c, motion_known))
-        c.imu_log_ratios = now.telemetry.by_imu(c, motion_known)
+        log_ratios = now.telemetry.of(c, motion_known)
+        c.add_log_ratios(log_ratios)
+        # the odometry was made with the same IMU: it counts once
+        c.imu_log_ratios = now.telemetry.by_imu(c, motion_known) if log_ratios is None else None
         c.features = features_of(c, settings.span_m, motion_known)
         if not settings.free_space:
             c.features[list(FREE_SPACE)] = math.nan

@@ -1,7 +1,8 @@
 """Physical features of a candidate: the input of the trained model, and the columns of a run's candidate log.
 
 `features_of` is a pure function of a candidate's history. A feature that is not available (no telemetry, too few
-observations for a speed) is NaN. VERSION changes with the list or the meaning of a feature.
+observations for a speed) is NaN; so are those by the IMU while telemetry is compared, which was made with the same IMU.
+VERSION changes with the list or the meaning of a feature.
 
 Each that a model uses is monotone: what has no sign by physics, as the range, climb or age of a candidate, tells more
 of the flights of a simulator than of the candidate. The range is logged only. No sum over a candidate's history counts
@@ -25,7 +26,7 @@ from stages.detect.flight import Motion, straight_flight
 from stages.detect.motion_log_ratios import MotionLogRatios
 from stages.geometry.frames import Array64
 
-VERSION = 7
+VERSION = 8
 PULSE_RAD = math.radians(0.2)  # between two pulses of a laser: VLP-16, 600 rpm
 NONE_M = 4.0  # written where no large object is near
 NOT_DISPLACED_NATS = 3.0  # cap of the log ratio over a static object that may seem to move as far

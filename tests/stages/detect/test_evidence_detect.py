@@ -767,6 +767,25 @@ def test_the_imu_is_compared_with_a_candidate_without_the_autopilots_estimate():
     assert last["imu_over_static_nats"] > 0.0  # it flies straight on
 
 
+def test_the_imu_is_no_evidence_while_the_odometry_made_with_it_is():
+    stage, logged = EvidenceDetect(parked=True), []
+    for k in range(1, 250):
+        stage.on_drone_motion(drone_motion(0.02 * k))
+    for pulses in pulses_seen([Drone(MOVING)], WATCHING, 4.5):
+        t_s = (pulses.stamp_ns - START_NS) * 1e-9
+        if t_s < 1.5:
+            stage.on_drone_position(local_position(MOVING, t_s))
+        logged += [m for m in stage.on_pulses(pulses) if isinstance(m, CandidateLog)]
+    last_s = np.array([(m.seen_ns[0] - START_NS) * 1e-9 for m in logged])
+    by_odometry, by_imu = (
+        np.array([m.features[0, NAMES.index(name)] for m in logged]) for name in ("over_bird_nats", "imu_over_bird_nats")
+    )
+    during, after = (last_s > 0.5) & (last_s < 3.0), last_s > 4.0  # telemetry is too old after 2 s
+    assert during.any() and not np.isnan(by_odometry[during]).any() and np.isnan(by_imu[during]).all()
+    assert after.any() and not np.isnan(by_imu[after]).any()
+    assert (by_odometry[after] == by_odometry[after][0]).all()  # it remains
+
+
 def test_every_classified_candidate_is_logged_with_its_features():
     stage, logged = EvidenceDetect(sweep_deg=PASS_DEG), []
     for pulses in pulses_seen([Drone(MOVING)], WATCHING, 1.5):

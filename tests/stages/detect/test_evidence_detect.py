@@ -778,11 +778,15 @@ def test_the_imu_is_no_evidence_while_the_odometry_made_with_it_is():
         logged += [m for m in stage.on_pulses(pulses) if isinstance(m, CandidateLog)]
     last_s = np.array([(m.seen_ns[0] - START_NS) * 1e-9 for m in logged])
     by_odometry, by_imu = (
-        np.array([m.features[0, NAMES.index(name)] for m in logged]) for name in ("over_bird_nats", "imu_over_bird_nats")
+        np.array([m.features[0, NAMES.index(name)] for m in logged])
+        for name in ("over_bird_nats", "imu_over_bird_nats")
     )
     during, after = (last_s > 0.5) & (last_s < 3.0), last_s > 4.0  # telemetry is too old after 2 s
-    assert during.any() and not np.isnan(by_odometry[during]).any() and np.isnan(by_imu[during]).all()
-    assert after.any() and not np.isnan(by_imu[after]).any()
+    assert during.any()
+    assert not np.isnan(by_odometry[during]).any()
+    assert np.isnan(by_imu[during]).all()
+    assert after.any()
+    assert not np.isnan(by_imu[after]).any()
     assert (by_odometry[after] == by_odometry[after][0]).all()  # it remains
 
 

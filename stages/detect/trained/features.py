@@ -5,8 +5,8 @@ observations for a speed) is NaN; so are those by the IMU while telemetry is com
 VERSION changes with the list or the meaning of a feature.
 
 Each that a model uses is monotone: what has no sign by physics, as the range, climb or age of a candidate, tells more
-of the flights of a simulator than of the candidate. The range is logged only. No sum over a candidate's history counts
-against a drone: it would grow with the length of the flight.
+of the flights of a simulator than of the candidate. The range is logged only. What counts against a drone chord by
+chord or pass by pass is a share of them: their number would grow with the length of the flight.
 
 Features depend on the classifier of the run, which decides which candidates are kept and counted. Train on replays with
 the classifier that the model replaces, then again on replays with the model.

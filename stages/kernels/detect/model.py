@@ -55,4 +55,4 @@ def evaluate(
         for k in range(over.size):
             weighted += contributions[k, feature] * weight[k] / total
         contributions[0, feature] = weighted
-    return least - math.log(total), alternative, contributions[0]
+    return least - math.log(total), alternative, contributions[0]  # pyright: ignore[reportReturnType]

@@ -174,20 +174,13 @@ class Hasher(Protocol):
 
 
 _pack_float = struct.Struct("<d").pack
-_array_headers: dict[tuple[np.dtype[Any], tuple[int, ...]], bytes] = {}  # few types and shapes, hashed often
-MAX_ARRAY_HEADERS = 4096
 SMALL_BYTES = 2048  # copying a smaller array takes less time than a view of it
 
 
-def _array_header(array: NDArray[Any]) -> bytes:
+@functools.lru_cache(maxsize=4096)  # few types and shapes, hashed often
+def _array_header(dtype: np.dtype[Any], shape: tuple[int, ...]) -> bytes:
     """An array's type and shape, as they are hashed."""
-    key = array.dtype, array.shape
-    header = _array_headers.get(key)
-    if header is None:
-        if len(_array_headers) >= MAX_ARRAY_HEADERS:
-            _array_headers.clear()
-        header = _array_headers[key] = f"[{array.dtype.str}{array.shape}".encode()
-    return header
+    return f"[{dtype.str}{shape}".encode()
 
 
 class _Parts:
@@ -265,7 +258,7 @@ def _add_each(parts: _Parts, items: tuple[Any, ...]) -> None:
 
 
 def _add_array(parts: _Parts, array: NDArray[Any]) -> None:
-    parts.values.append(_array_header(array))
+    parts.values.append(_array_header(array.dtype, array.shape))
     if array.nbytes < SMALL_BYTES:
         parts.values.append(array.tobytes())
     else:

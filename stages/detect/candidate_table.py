@@ -14,7 +14,7 @@ import numpy as np
 from stages.detect.candidate import Candidate, Observation
 from stages.detect.observations import Slice
 from stages.geometry.frames import Array64
-from stages.kernels.detect.candidate_table import NO_PULSE, OUTSIDE, count_pulses, nearest_row
+from stages.kernels.detect.candidate_table import NO_PULSE, OUTSIDE, count_pulses, nearest_rows
 
 ROWS = 64  # initial size; the table grows
 STATE = 9  # columns: position, velocity, variances
@@ -63,13 +63,14 @@ class CandidateTable:
         for c in kept:
             self.put(c)
 
-    def best_fit(self, s: Observation, reacquired: bool = False) -> Candidate | None:
-        """The most probable candidate for an observation, of the reacquired or of the others; None: none fits."""
+    def best_fits(self, s: Observation) -> tuple[Candidate | None, Candidate | None]:
+        """The most probable candidates for an observation, of the reacquired and of the others; None: none fits."""
         rows = len(self._candidates)
         if not rows:
-            return None
-        row = nearest_row(self._state, self._ns, self._reacquired, rows, reacquired, s.stamp_ns, s.xyz_map_m)
-        return self._candidates[row] if row >= 0 else None
+            return None, None
+        found = nearest_rows(self._state, self._ns, self._reacquired, rows, s.stamp_ns, s.xyz_map_m)
+        reacquired, other = (self._candidates[row] if row >= 0 else None for row in found)
+        return reacquired, other
 
     def pass_throughs_of(
         self, part: Slice, origin_m: Array64, disc_m: float, most_variance: float

@@ -215,10 +215,10 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
 
     def _associate(self, now: _State, s: Observation) -> bool:
         """Assign an observation to the candidate that it fits, or start a new one. True: publish a change."""
-        reacquired = now.table.best_fit(s, reacquired=True)
+        reacquired, other = now.table.best_fits(s)
         if reacquired is not None:
             self._update(now, reacquired, s)
-        best = now.table.best_fit(s) or self._reactivate(now, s)
+        best = other or self._reactivate(now, s)
         if best is not None:
             return self._update(now, best, s) or reacquired is not None
         since_ns = s.stamp_ns - (NEAR_REJECTED_NS if self._motion_known(s.stamp_ns) else NEAR_REJECTED_NS // 20)

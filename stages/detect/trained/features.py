@@ -95,7 +95,7 @@ def features_of(c: Candidate, span_m: float, motion_known: bool) -> Array64:
 
     `span_m`: of the drone; `motion_known`: whether positions in frame map are those over ground.
     """
-    passes = float(c.scan_passes)
+    passes, free = float(c.scan_passes), c.free.tolist()
     m, slower = c.motion or NOT_MEASURED, c.slower_motion or NOT_MEASURED
     speed, sigmas = straight_flight(c.path_ns, c.path_m, c.range_m)
     ratios, imu = c.log_ratios, c.imu_log_ratios
@@ -110,8 +110,8 @@ def features_of(c: Candidate, span_m: float, motion_known: bool) -> Array64:
             c.first_returns,
             c.returns / c.observations * PULSE_RAD * c.range_m / span_m,
             c.return_count_nats,
-            np.count_nonzero(c.free >= 1.0),
-            c.free.min(),
+            sum([times >= 1.0 for times in free]),
+            min(free),
             c.neighbour_score,
             c.isolated_score,
             min(c.large_object_m, NONE_M),

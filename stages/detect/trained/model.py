@@ -91,13 +91,16 @@ class DetectorModel(StrictModel):
             knots[row, : len(term.knots)], values[row, : len(term.knots)] = term.knots, term.values
         return np.array(where, dtype=np.int64), knots, values, np.array([term.missing for term in self.terms])
 
+    @cached_property
+    def _priors(self) -> tuple[Array64, Array64]:
+        """Of each alternative (alternatives,), without and with telemetry."""
+        without, compared = np.array(self.priors).T.copy()
+        return without, compared
+
     def predict(self, features: Array64) -> Prediction:
         """Log-odds of a drone for features (len(FEATURES),)."""
         compared = not math.isnan(features[TELEMETRY])
-        over = np.array([prior[compared] for prior in self.priors])
-        contributions = np.zeros((len(ALTERNATIVES), len(NAMES)))
-        log_odds = evaluate(*self._tables, features, over, contributions)
-        return Prediction(log_odds, int(np.argmin(over)), contributions[0])
+        return Prediction(*evaluate(*self._tables, self._priors[int(compared)], features))
 
     def classify(self, c: Candidate) -> Prediction:
         """Whether the candidate is a drone by its `features`. Sets `c.alternative` and `c.rejection`."""

@@ -44,29 +44,27 @@ def predicted(state: Array64, dt_s: float) -> tuple[float, float, float, float]:
 
 
 @compiled
-def nearest_row(
-    state: Array64,
-    ns: NDArray[np.int64],
-    reacquired: NDArray[np.bool_],
-    rows: int,
-    select_reacquired: bool,
-    stamp_ns: int,
-    xyz_m: Array64,
-) -> int:
-    """Row of the candidate whose prediction is nearest to an observation, in sigmas; -1: none.
+def nearest_rows(
+    state: Array64, ns: NDArray[np.int64], reacquired: NDArray[np.bool_], rows: int, stamp_ns: int, xyz_m: Array64
+) -> tuple[int, int]:
+    """Rows of the candidates whose predictions are nearest to an observation, in sigmas; -1: none.
 
-    Only the first `rows` rows count, of reacquired candidates or of the others.
+    One of the reacquired candidates and one of the others; only the first `rows` rows count.
     """
-    best, least = -1, MAX_COST
+    best_reacquired, least_reacquired, best, least = -1, MAX_COST, -1, MAX_COST
     for row in range(rows):
-        if reacquired[row] != select_reacquired or stamp_ns < ns[row, STAMP]:
+        if stamp_ns < ns[row, STAMP]:
             continue
         x, y, z, variance = predicted(state[row], (stamp_ns - ns[row, STAMP]) * 1e-9)
         away2 = (xyz_m[0] - x) ** 2 + (xyz_m[1] - y) ** 2 + (xyz_m[2] - z) ** 2
         cost = away2 / (variance + SIGMA_M**2)
-        if cost < least and away2 < FURTHEST_STEP_M**2:
+        if away2 >= FURTHEST_STEP_M**2:
+            continue
+        if reacquired[row] and cost < least_reacquired:
+            best_reacquired, least_reacquired = row, cost
+        elif not reacquired[row] and cost < least:
             best, least = row, cost
-    return best
+    return best_reacquired, best
 
 
 @compiled

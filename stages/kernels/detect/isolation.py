@@ -67,13 +67,13 @@ def count_sectors(
                 tally[INNER_HITS] += 1
             else:
                 tally[INNER_PASSES] += 1
-        elif away >= inner_m:
+        elif away >= inner_m and (hit or away <= close_m):
             sector = int((math.atan2(b, a) + math.pi) / (2 * math.pi) * SECTORS) % SECTORS
             if hit and away <= close_m:
                 tally[OCCUPIED_0 + sector] += 1
             elif hit:
                 tally[FARTHER_0 + sector] += 1
-            elif away <= close_m:
+            else:
                 tally[FREE_0 + sector] += 1
 
 

@@ -20,15 +20,15 @@ def evaluate(
     knots: Array64,
     values: Array64,
     missing: Array64,
+    priors: Array64,
     x: Array64,
-    over: Array64,
-    contributions: Array64,
-) -> float:
-    """Log-odds of a drone for features x (n,); see `DetectorModel` for where, knots, values, missing.
+) -> tuple[float, int, Array64]:
+    """(log-odds of a drone, most probable alternative, contributions (n,)) for features x (n,).
 
-    Adds the terms to over (alternatives,), which holds the priors. Row 0 of contributions (alternatives, n) becomes the
-    contribution of each feature: its terms, each weighted by the probability of its alternative among them.
+    See `DetectorModel` for where, knots, values, missing; priors (alternatives,). The contribution of a feature is that
+    of its terms, each weighted by the probability of its alternative among them.
     """
+    over, contributions = priors.copy(), np.zeros((priors.size, x.size))
     for row in range(where.shape[0]):
         alternative, feature, last = where[row, 0], where[row, 1], where[row, 2] - 1
         value = x[feature]
@@ -46,12 +46,13 @@ def evaluate(
             nats = values[row, k - 1] + share * (values[row, k] - values[row, k - 1])
         over[alternative] += nats
         contributions[alternative, feature] += nats
-    least = over.min()
+    alternative = np.argmin(over)
+    least = over[alternative]
     weight = np.exp(least - over)
     total = weight.sum()
     for feature in range(x.size):
         weighted = 0.0
-        for alternative in range(over.size):
-            weighted += contributions[alternative, feature] * weight[alternative] / total
+        for k in range(over.size):
+            weighted += contributions[k, feature] * weight[k] / total
         contributions[0, feature] = weighted
-    return least - math.log(total)
+    return least - math.log(total), alternative, contributions[0]  # pyright: ignore[reportReturnType]

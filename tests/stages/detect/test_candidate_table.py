@@ -49,15 +49,25 @@ def slice_towards(*positions_m, range_m, stamp_ns=NOW_NS):
 
 
 def test_an_observation_fits_the_nearest_candidate_in_sigmas():
-    found = table(PLACE_M, offset_by(0.0, 0.0, 1.0), offset_by(0.0, 0.6, 0.0)).best_fit(observation(0.1))
+    found = table(PLACE_M, offset_by(0.0, 0.0, 1.0), offset_by(0.0, 0.6, 0.0)).best_fits(observation(0.1))[1]
     assert found is not None
     assert found.number == 0
 
 
+def test_a_reacquired_candidate_and_another_are_found_each_on_its_own():
+    made = table(PLACE_M, offset_by(0.0, 0.2, 0.0), offset_by(0.0, 0.1, 0.0))
+    nearest, _, middle = made
+    assert made.best_fits(observation(0.1)) == (None, nearest)
+    for c in (nearest, middle):
+        c.reacquired_at = 1
+        made.put(c)
+    assert made.best_fits(observation(0.1)) == (nearest, list(made)[1])
+
+
 def test_it_fits_no_distant_or_later_candidate():
-    assert table(offset_by(3.0, 0.0, 0.0)).best_fit(observation(0.1)) is None
-    assert table(PLACE_M).best_fit(observation(0.05)) is None
-    assert CandidateTable().best_fit(observation(0.1)) is None
+    assert table(offset_by(3.0, 0.0, 0.0)).best_fits(observation(0.1))[1] is None
+    assert table(PLACE_M).best_fits(observation(0.05))[1] is None
+    assert CandidateTable().best_fits(observation(0.1))[1] is None
 
 
 def test_a_candidate_is_predicted_with_its_velocity():
@@ -65,20 +75,20 @@ def test_a_candidate_is_predicted_with_its_velocity():
     (c,) = made
     c.velocity_mps = np.array([10.0, 0.0, 0.0])
     made.put(c)
-    assert made.best_fit(observation(0.2, offset_by(1.0, 0.0, 0.0))) is c
-    assert made.best_fit(observation(0.2, offset_by(-1.0, 0.0, 0.0))) is None
+    assert made.best_fits(observation(0.2, offset_by(1.0, 0.0, 0.0)))[1] is c
+    assert made.best_fits(observation(0.2, offset_by(-1.0, 0.0, 0.0)))[1] is None
 
 
 def test_the_table_grows_and_removes_candidates():
     made = table(*(offset_by(0.0, 10.0 * k, 0.0) for k in range(2 * ROWS + 1)))
     assert len(made) == 2 * ROWS + 1
     for k in (0, ROWS, 2 * ROWS):
-        found = made.best_fit(observation(0.1, offset_by(0.0, 10.0 * k, 0.0)))
+        found = made.best_fits(observation(0.1, offset_by(0.0, 10.0 * k, 0.0)))[1]
         assert found is not None
         assert found.number == k
     made.keep([c for c in made if c.number == ROWS])
     assert [c.number for c in made] == [ROWS]
-    assert made.best_fit(observation(0.1)) is None
+    assert made.best_fits(observation(0.1))[1] is None
 
 
 @pytest.mark.parametrize(("range_m", "returns", "pass_throughs"), [(0.0, 0, 2), (math.sqrt(378.0), 2, 0)])

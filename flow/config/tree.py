@@ -166,7 +166,7 @@ def _read(file: Path, tree: Tree, including: tuple[Path, ...]) -> Tree:
     for entry in cast("list[Any]", includes if isinstance(includes, list) else [includes]):
         location = own.location(("include",))
         copied = cast("dict[str, Any]", entry) if isinstance(entry, dict) else {}
-        name = copied.get("file") if copied else entry
+        name: Any = copied.get("file") if copied else entry
         if not isinstance(name, str) or (copied and not _is_copy(copied)):
             text = f"must be a file name, {COPY_FORM}, or a list of them, got {entry!r}."
             tree.errors.append(ErrorDetail(location, "include", text))
@@ -200,25 +200,33 @@ def _copied(included: Tree, entry: dict[str, Any], tree: Tree, location: Locatio
     `{file: estimate.yaml, nodes: [detect, track], suffix: _2}` gives detect_2 and track_2; track_2 takes the detections
     of detect_2 and, as track does, the pulses of sweep.
     """
-    suffix, renamed = entry["suffix"], {name: name + entry["suffix"] for name in entry["nodes"]}
+    suffix: str = entry["suffix"]
+    names: dict[str, str] = {name: name + suffix for name in entry["nodes"]}
     own = Tree(root=included.root)
+    known: list[str] = []
     for kind in ("stages", "links"):
-        for name, node in (included.values.get(kind) or {}).items():
-            if name not in renamed:
-                continue
-            inputs: dict[str, Any] = node.get("inputs") or {}
-            copy = node | ({"inputs": {port: _renamed(source, renamed) for port, source in inputs.items()}} if inputs else {})
-            own.values.setdefault(kind, {})[name + suffix] = copy
-            for path, at in included.locations.items():
-                if path[:2] == (kind, name):
-                    own.locations[(kind, name + suffix, *path[2:])] = at
-    found = {name for kind in ("stages", "links") for name in own.values.get(kind, {})}
-    for name, copy in renamed.items():
-        if copy not in found:
-            known = [n for kind in ("stages", "links") for n in included.values.get(kind) or {}]
+        section = included.values.get(kind)
+        nodes = cast("dict[str, Any]", section) if isinstance(section, dict) else {}
+        known += nodes
+        own.values[kind] = {names[name]: _with_inputs(node, names) for name, node in nodes.items() if name in names}
+    for path, at in included.locations.items():
+        if len(path) > 1 and path[0] in own.values and path[1] in names:
+            own.locations[(path[0], names[path[1]], *path[2:])] = at
+    for name in names:
+        if name not in known:
             text = f"'{entry['file']}' has no stage or link '{name}'.{did_you_mean(name, known)}"
             tree.errors.append(ErrorDetail(location, "include", text))
     return own
+
+
+def _with_inputs(node: Any, names: dict[str, str]) -> Any:
+    """A stage or link whose inputs name the renamed nodes."""
+    own = cast("dict[str, Any]", node) if isinstance(node, dict) else {}
+    inputs = own.get("inputs")
+    if not isinstance(inputs, dict):
+        return cast(Any, node)
+    sources = cast("dict[str, Any]", inputs)
+    return own | {"inputs": {port: _renamed(source, names) for port, source in sources.items()}}
 
 
 def _renamed(source: Any, names: dict[str, str]) -> Any:

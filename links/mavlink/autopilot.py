@@ -64,7 +64,7 @@ class AutopilotSettings(SourceSettings):
     own_system_id: int | None = Field(None, ge=1, le=255)  # None: the autopilot's, as a component of its vehicle
     own_component_id: int = Field(VISUAL_INERTIAL_ODOMETRY, ge=1, le=255)
     signing_key: Path | None = None  # a file of 32 bytes or 64 hexadecimal digits, mode 0600
-    # remembers over restarts that a pose was sent; that of topic rx_2 has _2 in its name; None: a start is the first one
+    # remembers over restarts that a pose was sent; of topic rx_2 with _2 in its name; None: a start is the first one
     state_file: Path | None = None
     global_origin: GlobalOrigin | None = None  # sent to an autopilot without an origin
     message_rates: MessageRates = MessageRates()  # requested from the autopilot
@@ -76,7 +76,7 @@ class AutopilotSettings(SourceSettings):
 
     @property
     def own_state_file(self) -> Path | None:
-        """`state_file` with the number of the topic: autopilot_sent_2.json. Two links with one setting have two files."""
+        """`state_file` with the topic's number, autopilot_sent_2.json: two links with one setting have two files."""
         number = self.topic.partition("/rx")[2]
         return self.state_file and self.state_file.with_stem(self.state_file.stem + number)
 

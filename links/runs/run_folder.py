@@ -1,9 +1,10 @@
 """The output folder of a run: configuration, results, errors against the truth, and a summary.
 
 A replay, a live run and a simulated closed loop leave the same files. With several drones the folder has the files of
-the first, and a folder in it, named after the stage (`fuse_2`), those of each further fused pose. Replays of several recordings (`replay_all`) are
-independent tasks: a folder that holds a complete run of the same recording and settings is kept, and a recording that
-fails does not stop the others.
+the first, and a folder in it, named after the stage (`fuse_2`), those of each further fused pose.
+
+Replays of several recordings (`replay_all`) are independent tasks: a folder that holds a complete run of the same
+recording and settings is kept, and a recording that fails does not stop the others.
 
 Source: DESIGN, Outputs of a run.
 """
@@ -72,7 +73,11 @@ class RunFolder:
         self._results, self._open = Results(**gate).without(frozenset().union(*chains.values())), ExitStack()
         self._further = {stage: Results(**gate).without(graph.nodes.keys() - own) for stage, own in chains.items()}
         declared = [spec.build() for spec in graph.nodes.values() if issubclass(spec.cls, Tap)]
-        self.taps: list[Tap] = [self._results, *self._further.values(), *(tap for tap in declared if isinstance(tap, Tap))]
+        self.taps: list[Tap] = [
+            self._results,
+            *self._further.values(),
+            *(tap for tap in declared if isinstance(tap, Tap)),
+        ]
         self._viewers = _viewers(self.taps, gate)
 
     def __enter__(self) -> RunFolder:

@@ -8,7 +8,7 @@
                                segment of the sweep between them
 
 Each drone has a chain of stages. That of the first has the ports `state` and `candidates`, the others `state_2`,
-`candidates_2` and so on. Two chains that follow one object, until their telemetry tells which drone it is, count as one.
+`candidates_2` and so on. The tracks of two chains that follow one object count as one.
 
 The rotor's azimuth determines when it passes a direction next. The table moves between two passes and stands still
 during a pass, so that the offsets are chosen and do not depend on the beat of two periods. Of all beams that can be
@@ -100,7 +100,9 @@ class BeamAimSettings(Settings):
     max_missed: int = Field(8, ge=1, le=MAX_MISSED)  # consecutive misses of a candidate of probability 1; else fewer
     sweep_observations: int = Field(3, ge=0)  # of a candidate, without an interruption of the sweep
     observations_per_track: int = Field(3, ge=1)  # consecutive ones of each track, if there are several
-    max_drones: int = Field(1, ge=1, le=MAX_DRONES)  # expected, at least one a chain; with fewer tracks the search goes on
+    max_drones: int = Field(
+        1, ge=1, le=MAX_DRONES
+    )  # expected, at least one a chain; with fewer tracks the search goes on
     search_s: float = Field(0.35, gt=0)  # duration of a search segment between observations of tracks
     beams: bool = True  # point a beam at the drone; False (ablation): the middle of the fan
     coast_sigma_m: float = Field(3.0, gt=0)  # a track with a larger position sigma is searched with the full sweep

@@ -3,8 +3,8 @@
 Its estimate is the truth with the errors of `drift`, in a local frame with its origin at the start of the scenario and
 any north. Like ArduPilot it sends HEARTBEAT, ATTITUDE, LOCAL_POSITION_NED, ODOMETRY (LOCAL_FRD, BODY_FRD), RAW_IMU (mg,
 mrad/s), with a receiver GPS_RAW_INT and GLOBAL_POSITION_INT, and a TIMESYNC request every 10 s, and replies to those of
-the host, which are recorded on /autopilot/tx; that of a second drone has the topics /autopilot/rx_2 and tx_2. A message is sampled on the autopilot's clock, sent by its main loop a
-little later, and delayed by the radio.
+the host, which are recorded on /autopilot/tx. A message is sampled on the autopilot's clock, sent by its main loop a
+little later, and delayed by the radio. The autopilot of drone 2 has the topics /autopilot/rx_2 and /autopilot/tx_2.
 
 Differences to a real flight (copter log of dronekit over a SiK telemetry radio; ours is the link of a companion):
   MAVLink 1; each message at 2.7 Hz, no ODOMETRY, no TIMESYNC; 45 gaps, the longest 18.8 s; a reboot during the log

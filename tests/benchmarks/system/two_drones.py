@@ -62,9 +62,9 @@ def scenario(kind: str, seed: int, attempt: int) -> Scenario:
     paths: list[np.ndarray] = []
     for motion, at in zip(KINDS.get(kind, ("wander",)), (azimuth, azimuth + apart), strict=False):
         cell = Cell("open_lot", 20, motion, "parked")
-        paths.append(next(motions(cell, at, rng.uniform(0.7, 1.2)))(knots) + [0.0, 0.0, LIDAR_UP_M])
+        paths.append(next(motions(cell, at, rng.uniform(0.7, 1.2)))(knots) + np.array([0.0, 0.0, LIDAR_UP_M]))
     if kind == "formation":
-        paths.append(paths[0] + [4.0 * np.cos(azimuth + apart), 4.0 * np.sin(azimuth + apart), 0.0])
+        paths.append(paths[0] + 4.0 * np.array([np.cos(azimuth + apart), np.sin(azimuth + apart), 0.0]))
     drones = [{"path": path_of(knots, path), "model": DRONE} for path in paths]
     other = {**drones[1], "autopilot": {"heading_of_world_x_deg": 140.0, "boot_s": 95.5}}
     return base.changed(duration_s=DURATION_S, drone=drones[0], other_drones=[other], truth_visible=False)
@@ -77,7 +77,9 @@ def fly(kind: str, seed: int, sets: Sequence[str]) -> list[str]:
             flight = scenario(kind, seed, attempt)
             outputs, request = Outputs(), RunRequest(CONFIG, sets=("viewer.file=null", *sets))
             graph = request.graph(flight.rig_yaml(), flight.name)
-            simulation = Simulation(flight, loop=ClosedLoop(graph, flight.closed_loop, {}, (outputs,)), record_truth=False)
+            simulation = Simulation(
+                flight, loop=ClosedLoop(graph, flight.closed_loop, {}, (outputs,)), record_truth=False
+            )
         except (LinkError, ValueError):  # a path meets the scene or the other drone
             continue
         for _ in simulation.records():
@@ -125,9 +127,9 @@ def main() -> None:
     parser.add_argument("--flights", type=int, default=5)
     parser.add_argument("--set", action="append", default=[], help="a setting, as aim.search_s=0.8")
     args = parser.parse_args()
-    print(HEAD)
+    print(HEAD)  # noqa: T201
     for seed in range(args.first_seed, args.first_seed + args.flights):
-        print("\n".join(fly(args.kind, seed, args.set)), flush=True)
+        print("\n".join(fly(args.kind, seed, args.set)), flush=True)  # noqa: T201
 
 
 if __name__ == "__main__":

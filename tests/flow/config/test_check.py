@@ -346,7 +346,10 @@ def test_an_include_copies_some_nodes_under_other_names(tmp_path):
             "x.yaml:1: include: must be a file name, {file: ..., nodes: [...], suffix: ...}, or a list of them, "
             "got {'file': 'base.yaml', 'suffix': '_2'}.",
         ),
-        ("{file: bse.yaml, nodes: [], suffix: _2}", "x.yaml:1: include: no such file 'bse.yaml'. Did you mean 'base.yaml'?"),
+        (
+            "{file: bse.yaml, nodes: [], suffix: _2}",
+            "x.yaml:1: include: no such file 'bse.yaml'. Did you mean 'base.yaml'?",
+        ),
     ],
 )
 def test_a_copy_that_is_impossible_is_an_error(tmp_path, entry, error):

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pydantic import ValidationError
 from pymavlink.dialects.v20 import ardupilotmega
 
 from flow.link import Record

@@ -241,7 +241,10 @@ def test_only_the_first_drone_flies_on_what_grd_sends(pair: Scenario) -> None:
 
 
 def test_a_run_with_two_chains_has_a_folder_for_each(own_telemetry: Scenario, tmp_path: FilePath) -> None:
-    recording, request = tmp_path / "pair.mcap", RunRequest(FilePath("configs/two_drones.yaml"), (), ("viewer.file=null",))
+    recording, request = (
+        tmp_path / "pair.mcap",
+        RunRequest(FilePath("configs/two_drones.yaml"), (), ("viewer.file=null",)),
+    )
     run.simulate_into(recording, own_telemetry)
     result = replay_into(tmp_path / "run", recording, request)
     own, other = (json.loads((tmp_path / name / "summary.json").read_text()) for name in ("run", "run/fuse_2"))

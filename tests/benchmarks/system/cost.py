@@ -106,7 +106,7 @@ def main() -> None:
     parser.add_argument("what", choices=["drones", "cameras", "recordings"])
     parser.add_argument("files", type=Path, nargs="*")
     parser.add_argument("--rounds", type=int, default=3)
-    args = parser.parse_args()
+    args = parser.parse_intermixed_args()
     spawn = multiprocessing.get_context("spawn")
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

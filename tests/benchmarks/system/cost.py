@@ -49,7 +49,7 @@ class Cost(NamedTuple):
 
     cpu: float  # seconds per recorded second
     peak_mb: float  # resident memory of the process, with the recording's records
-    stages_ms: dict[str, float]  # computing time of each stage [ms per recorded second]
+    shares: dict[str, float]  # of the nodes' computing time [%]
 
 
 def drones(folder: Path) -> Iterator[Case]:
@@ -96,8 +96,9 @@ def measure(case: Case) -> Cost:
     began_s = time.process_time()
     report = replay(graph, records, [])
     cpu_s = time.process_time() - began_s
-    stages_ms = {name: node.compute.total_ns * 1e-6 / seconds for name, node in report.nodes.items()}
-    return Cost(cpu_s / seconds, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, stages_ms)
+    total_ns = sum(node.compute.total_ns for node in report.nodes.values())
+    shares = {name: 100 * node.compute.total_ns / total_ns for name, node in report.nodes.items()}
+    return Cost(cpu_s / seconds, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, shares)
 
 
 def main() -> None:
@@ -120,9 +121,11 @@ def main() -> None:
     for case_name, measured in costs.items():
         median = sorted(measured)[len(measured) // 2]
         spread = f"{min(measured)[0]:.3f} to {max(measured)[0]:.3f}"
-        stages = ", ".join(f"{n} {ms:.1f}" for n, ms in sorted(median.stages_ms.items(), key=lambda item: -item[1])[:8])
+        shares = ", ".join(
+            f"{n} {part:.0f}" for n, part in sorted(median.shares.items(), key=lambda item: -item[1])[:8]
+        )
         peak_mb = statistics.median(cost.peak_mb for cost in measured)
-        sys.stdout.write(f"{case_name}: {median.cpu:.3f} core ({spread}), {peak_mb:.0f} MB; [ms/s] {stages}\n")
+        sys.stdout.write(f"{case_name}: {median.cpu:.3f} core ({spread}), {peak_mb:.0f} MB; [%] {shares}\n")
 
 
 if __name__ == "__main__":

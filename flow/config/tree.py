@@ -166,7 +166,7 @@ def _read(file: Path, tree: Tree, including: tuple[Path, ...]) -> Tree:
     for entry in cast("list[Any]", includes if isinstance(includes, list) else [includes]):
         location = own.location(("include",))
         copied = cast("dict[str, Any]", entry) if isinstance(entry, dict) else {}
-        name = cast(Any, copied.get("file", entry))
+        name = copied.get("file", entry)
         if not isinstance(name, str) or (copied and not _is_copy(copied)):
             text = f"must be a file name, {COPY_FORM}, or a list of them, got {entry!r}."
             tree.errors.append(ErrorDetail(location, "include", text))

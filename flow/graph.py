@@ -70,23 +70,28 @@ class Graph:
         A partition is a stage that names a process, with every node that feeds it, directly or through others.
         Partitions that share a node, or name the same process, are one.
         """
-        producers: dict[str, set[str]] = {name: set() for name in self.nodes}
-        for edge in self.edges:
-            if self.nodes[edge.consumer].kind == "stages":  # a sink's inputs are for live runs
-                producers[edge.consumer].add(edge.producer)
         partitions: list[frozenset[str]] = []
         for spec in self.nodes.values():
             if not spec.process:
                 continue
-            nodes, open_nodes = {spec.name}, [spec.name]
-            while open_nodes:
-                new = producers[open_nodes.pop()] - nodes
-                nodes |= new
-                open_nodes += new
+            nodes = self.feeding(spec.name)
             related = nodes | {other.name for other in self.nodes.values() if other.process == spec.process}
             shared = [other for other in partitions if other & related]
-            partitions = [other for other in partitions if not other & related] + [frozenset(nodes).union(*shared)]
+            partitions = [other for other in partitions if not other & related] + [nodes.union(*shared)]
         return partitions
+
+    def feeding(self, stage: str) -> frozenset[str]:
+        """A stage with every node that feeds it, directly or through other stages."""
+        producers: dict[str, set[str]] = {name: set() for name in self.nodes}
+        for edge in self.edges:
+            if self.nodes[edge.consumer].kind == "stages":  # a sink's inputs are for live runs
+                producers[edge.consumer].add(edge.producer)
+        nodes, open_nodes = {stage}, [stage]
+        while open_nodes:
+            new = producers[open_nodes.pop()] - nodes
+            nodes |= new
+            open_nodes += new
+        return frozenset(nodes)
 
     def restricted_to(self, nodes: Collection[str]) -> Graph:
         """The graph of these nodes alone, with the edges among them; they are ranked as in the whole."""

@@ -21,7 +21,6 @@ from flow.link import Record, Tap
 from flow.message import Message
 from flow.replay import replay
 from flow.taps import Digest
-from links.mavlink.autopilot import SENT_TOPIC
 from links.mavlink.transport.framing import header, parse_frame
 from links.recording import RecordingReader
 
@@ -57,7 +56,7 @@ def first_part(recording: str, sent: bool) -> list[Record]:
     if sent:
         at_ns = start_ns + round(1e9 * SENT_S)
         frame = bytes(POSE.pack(mavlink.MAVLink(None, srcSystem=1, srcComponent=197)))
-        records.append(Record(SENT_TOPIC, at_ns, at_ns, frame))
+        records.append(Record("/autopilot/tx", at_ns, at_ns, frame))
     records.sort(key=lambda record: record.arrival_ns)
     return [record for record in records if record.arrival_ns < start_ns + round(1e9 * END_S)]
 

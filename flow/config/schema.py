@@ -34,6 +34,18 @@ _QUEUE = {
     },
 }
 _ANY_EDGE = {"anyOf": [_OUTPUT, _QUEUE, {"type": "null", "description": "unwired, where an included file wires it"}]}
+_COPY = {
+    "description": "some stages and links of a file, each name with the suffix",
+    "type": "object",
+    "additionalProperties": False,
+    "required": ["file", "nodes", "suffix"],
+    "properties": {
+        "file": {"type": "string"},
+        "nodes": {"type": "array", "items": {"type": "string"}},
+        "suffix": {"type": "string", "minLength": 1},
+    },
+}
+_INCLUDES = [{"type": "string"}, _COPY]
 _EDGE = {"$ref": "#/$defs/edge"}
 _THREAD = {"type": "string", "description": "live: stages that name one thread share it; default: a thread for each"}
 _PROCESS = {"type": "string", "description": "worker process; stages that name one process share it"}
@@ -58,7 +70,7 @@ def schema() -> dict[str, Any]:
         "properties": {
             TOP_LEVEL[0]: {
                 "description": "file or files that this one is merged over",
-                "anyOf": [{"type": "string"}, {"type": "array", "items": {"type": "string"}}],
+                "anyOf": [*_INCLUDES, {"type": "array", "items": {"anyOf": _INCLUDES}}],
             },
             TOP_LEVEL[1]: {"description": "the recording to replay, relative to this file", "type": "string"},
             TOP_LEVEL[2]: {"description": "values that settings refer to as $rig.name", "type": "object"},

@@ -2,6 +2,7 @@
 
 - `include:` composes files: included files come first, the including file on top. A file is looked for next to the
   including one, then among those that come with the program.
+- An include may take some stages and links of a file alone, under other names: see `_copied`.
 - Overlay files and `--set track.radius_m=0.8` change values.
 - `$rig.lidar.mount` is replaced by another value of the tree. `$rig.cameras.drone.readout_ms or 0` is 0 where the tree
   has no such value.
@@ -33,6 +34,7 @@ from flow.config.yaml_text import (
 from flow.config_error import ConfigError, ErrorDetail, Location, did_you_mean
 
 SHIPPED = Path(__file__).resolve().parents[2] / "configs"  # the configurations that come with the program
+COPY_FORM = "{file: ..., nodes: [...], suffix: ...}"
 Section = tuple[str, str]  # YAML text, and where it is from, for errors
 
 
@@ -161,10 +163,12 @@ def _read(file: Path, tree: Tree, including: tuple[Path, ...]) -> Tree:
 
     includes = own.values.pop("include", [])
     below = Tree(root=own.root)
-    for name in cast("list[Any]", includes if isinstance(includes, list) else [includes]):
+    for entry in cast("list[Any]", includes if isinstance(includes, list) else [includes]):
         location = own.location(("include",))
-        if not isinstance(name, str):
-            text = f"must be a file name or a list of them, got {name!r}."
+        copied = cast("dict[str, Any]", entry) if isinstance(entry, dict) else {}
+        name = copied.get("file", entry)
+        if not isinstance(name, str) or (copied and not _is_copy(copied)):
+            text = f"must be a file name, {COPY_FORM}, or a list of them, got {entry!r}."
             tree.errors.append(ErrorDetail(location, "include", text))
             continue
         target = file.parent / name
@@ -177,9 +181,61 @@ def _read(file: Path, tree: Tree, including: tuple[Path, ...]) -> Tree:
             near = _similar_file(target)
             tree.errors.append(ErrorDetail(location, "include", f"no such file '{name}'.{near}"))
         else:
-            _merge(below, _read(target, tree, chain))
+            included = _read(target, tree, chain)
+            _merge(below, _copied(included, copied, tree, location) if copied else included)
     _merge(below, own)
     return below
+
+
+def _is_copy(entry: dict[str, Any]) -> bool:
+    """Whether an include has the form COPY_FORM."""
+    nodes, suffix = entry.get("nodes"), entry.get("suffix")
+    names = isinstance(nodes, list) and all(isinstance(n, str) for n in cast("list[Any]", nodes))
+    return entry.keys() == {"file", "nodes", "suffix"} and names and isinstance(suffix, str) and suffix != ""
+
+
+def _copied(included: Tree, entry: dict[str, Any], tree: Tree, location: Location) -> Tree:
+    """Some stages and links of an included file, each name with the suffix; the edges among them lead to the copies.
+
+    `{file: estimate.yaml, nodes: [detect, track], suffix: _2}` gives detect_2 and track_2; track_2 takes the detections
+    of detect_2 and, as track does, the pulses of sweep.
+    """
+    suffix: str = entry["suffix"]
+    names: dict[str, str] = {name: name + suffix for name in entry["nodes"]}
+    own = Tree(root=included.root)
+    known: list[str] = []
+    for kind in ("stages", "links"):
+        section = included.values.get(kind)
+        nodes = cast("dict[str, Any]", section) if isinstance(section, dict) else {}
+        known += nodes
+        own.values[kind] = {names[name]: _with_inputs(node, names) for name, node in nodes.items() if name in names}
+    for path, at in included.locations.items():
+        if len(path) > 1 and path[0] in own.values and path[1] in names:
+            own.locations[(path[0], names[path[1]], *path[2:])] = at
+    for name in names:
+        if name not in known:
+            text = f"'{entry['file']}' has no stage or link '{name}'.{did_you_mean(name, known)}"
+            tree.errors.append(ErrorDetail(location, "include", text))
+    return own
+
+
+def _with_inputs(node: Any, names: dict[str, str]) -> Any:
+    """A stage or link whose inputs name the renamed nodes."""
+    own = cast("dict[str, Any]", node) if isinstance(node, dict) else {}
+    inputs = own.get("inputs")
+    if not isinstance(inputs, dict):
+        return cast(Any, node)
+    sources = cast("dict[str, Any]", inputs)
+    return own | {"inputs": {port: _renamed(source, names) for port, source in sources.items()}}
+
+
+def _renamed(source: Any, names: dict[str, str]) -> Any:
+    """An input's declaration, `node.output` or `{from: node.output, ...}`, with the node renamed."""
+    if isinstance(source, dict):
+        queue = cast("dict[str, Any]", source)
+        return queue | {"from": _renamed(queue.get("from"), names)}
+    node, dot, output = source.partition(".") if isinstance(source, str) else (source, "", "")
+    return f"{names[node]}{dot}{output}" if node in names else source
 
 
 def _similar_file(file: Path) -> str:

@@ -40,14 +40,14 @@ from links.mavlink.transport.stream_connection import open_connection
 from stages.messages import EarlierOdomFrame, RelativePose
 
 VISUAL_INERTIAL_ODOMETRY = 197  # MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY: our component id
-SENT_TOPIC = "/autopilot/tx"
+RECEIVED_TOPIC = "/autopilot/rx"  # of a second autopilot /autopilot/rx_2, and what is sent to it /autopilot/tx_2
 IS_KEY = re.compile(r"(0x)?[0-9a-fA-F]{64}")
 
 
 class AutopilotSettings(SourceSettings):
     """Settings of `Autopilot`."""
 
-    topic: str = "/autopilot/rx"
+    topic: str = Field(RECEIVED_TOPIC, pattern=r"^/\w+/rx(_\d+)?$")
     system_id: int = Field(1, ge=1, le=255)
     component_id: int = Field(1, ge=1, le=255)
     clock_drift_limit_ppm: float = Field(100.0, ge=0, le=10_000)
@@ -64,9 +64,21 @@ class AutopilotSettings(SourceSettings):
     own_system_id: int | None = Field(None, ge=1, le=255)  # None: the autopilot's, as a component of its vehicle
     own_component_id: int = Field(VISUAL_INERTIAL_ODOMETRY, ge=1, le=255)
     signing_key: Path | None = None  # a file of 32 bytes or 64 hexadecimal digits, mode 0600
-    state_file: Path | None = None  # remembers over restarts that a pose was sent; None: a start is the first one
+    # remembers over restarts that a pose was sent; of topic rx_2 with _2 in its name; None: a start is the first one
+    state_file: Path | None = None
     global_origin: GlobalOrigin | None = None  # sent to an autopilot without an origin
     message_rates: MessageRates = MessageRates()  # requested from the autopilot
+
+    @property
+    def sent_topic(self) -> str:
+        """Topic of the frames that were sent."""
+        return self.topic.replace("/rx", "/tx")
+
+    @property
+    def own_state_file(self) -> Path | None:
+        """`state_file` with the topic's number, autopilot_sent_2.json: two links with one setting have two files."""
+        number = self.topic.partition("/rx")[2]
+        return self.state_file and self.state_file.with_stem(self.state_file.stem + number)
 
     @property
     def required_parameters(self) -> tuple[RequiredParameter, ...]:
@@ -135,7 +147,7 @@ class Autopilot(Source[AutopilotSettings]):
 
     def decode(self, record: Record) -> AutopilotMessage | EarlierOdomFrame | None:
         """The message of one frame; None for an unused or rejected frame (see `counters`), and for a sent one."""
-        if record.topic == SENT_TOPIC:
+        if record.topic == self.settings.sent_topic:
             self._decoder.sent(record)
             return None
         return self._decoder.decode(record)
@@ -143,7 +155,7 @@ class Autopilot(Source[AutopilotSettings]):
     @property
     def replay_topics(self) -> tuple[str, ...]:
         """See Source: also what was sent, which decides whether the autopilot's estimate is independent."""
-        return self.settings.topic, SENT_TOPIC
+        return self.settings.topic, self.settings.sent_topic
 
     def on_pose(self, pose: RelativePose) -> None:
         """Send a pose if the gate accepts it. Nothing is sent before the link is open, or in replay."""
@@ -183,7 +195,7 @@ class Autopilot(Source[AutopilotSettings]):
         settings = self.settings
         target = settings.system_id, settings.component_id
         if self._sent_state is None:
-            self._sent_state = SentState(settings.state_file, now_ns())
+            self._sent_state = SentState(settings.own_state_file, now_ns())
         if self._poses is None:
             self._poses = PoseSender(
                 settings.send,
@@ -212,7 +224,7 @@ class Autopilot(Source[AutopilotSettings]):
             self._switch,
             self._signer,
             now_ns,
-            (settings.topic, SENT_TOPIC),
+            (settings.topic, settings.sent_topic),
             self._decoder.independence,
             self._sent_state,
             threaded=threaded,

@@ -115,7 +115,7 @@ _FIX = {
     "bias_sigma_m": _NUMBER,
 }
 _ROTATION = {"R": {"type": "array", "items": {"type": "array", "items": _NUMBER}}, "sigma_rad": _NUMBER}
-_NUMBERED = re.compile(r"(/truth/\w+?)_\d+")  # of a second drone, and so on
+_NUMBERED = re.compile(r"(/\w+/\w+?)_\d+")  # of a second drone, and so on
 
 _SERVO = {
     "position_rad": {"type": "number"},
@@ -159,7 +159,7 @@ TOPICS: dict[str, Topic] = {
 def topic(name: str) -> Topic:
     """Declaration of a topic; a topic that is not in the table holds raw bytes.
 
-    `/truth/drone_2` of a second drone is declared as `/truth/drone`.
+    Those of a second drone, `/truth/drone_2` and `/autopilot/rx_2`, are declared as those of the first.
     """
     numbered = _NUMBERED.fullmatch(name)
     if numbered is not None and (first := TOPICS.get(numbered[1])) is not None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import csv
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -113,6 +113,7 @@ class Results(Tap[ResultsSettings]):
 
     def __init__(self, settings: ResultsSettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
+        self._left_out: Collection[str] = ()
         self._files: dict[str, ResultFile] = {}
         self._live: bool = False
         self._covariance: Any = None
@@ -135,6 +136,11 @@ class Results(Tap[ResultsSettings]):
         self._fused: dict[str, bool] = {}  # cues in the fusion: whether used, by source
         self._resets: int = 0
         self._branch: tuple[str, int] | None = None  # state and switches of the newest rotation
+
+    def without(self, nodes: Collection[str]) -> Results:
+        """The same, leaving out the messages of some nodes: those of another drone."""
+        self._left_out = nodes
+        return self
 
     @property
     def fixes(self) -> Sequence[DroneFix]:
@@ -201,6 +207,8 @@ class Results(Tap[ResultsSettings]):
 
     def see(self, output: str, message: Message, arrival_ns: int) -> None:
         """Write a message to its file."""
+        if self._left_out and output.partition(".")[0] in self._left_out:
+            return
         if isinstance(message, DroneFix):
             self._fixes.append(message)
             self._files[FIX_FILE].write(tum_line(message.stamp_ns, message.xyz_vehicle_m))

@@ -1,8 +1,10 @@
 """The output folder of a run: configuration, results, errors against the truth, and a summary.
 
-A replay, a live run and a simulated closed loop leave the same files. Replays of several recordings (`replay_all`) are
-independent tasks: a folder that holds a complete run of the same recording and settings is kept, and a recording that
-fails does not stop the others.
+A replay, a live run and a simulated closed loop leave the same files. With several drones the folder has the files of
+the first, and a folder in it, named after the stage (`fuse_2`), those of each further fused pose.
+
+Replays of several recordings (`replay_all`) are independent tasks: a folder that holds a complete run of the same
+recording and settings is kept, and a recording that fails does not stop the others.
 
 Source: DESIGN, Outputs of a run.
 """
@@ -14,7 +16,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -67,9 +69,15 @@ class RunFolder:
         self._live = live
         self._started_s = time.monotonic() if started_s is None else started_s
         gate = _gate(graph)
-        self._results, self._open = Results(**gate), ExitStack()
+        chains = _further_chains(graph)
+        self._results, self._open = Results(**gate).without(frozenset().union(*chains.values())), ExitStack()
+        self._further = {stage: Results(**gate).without(graph.nodes.keys() - own) for stage, own in chains.items()}
         declared = [spec.build() for spec in graph.nodes.values() if issubclass(spec.cls, Tap)]
-        self.taps: list[Tap] = [self._results, *(tap for tap in declared if isinstance(tap, Tap))]
+        self.taps: list[Tap] = [
+            self._results,
+            *self._further.values(),
+            *(tap for tap in declared if isinstance(tap, Tap)),
+        ]
         self._viewers = _viewers(self.taps, gate)
 
     def __enter__(self) -> RunFolder:
@@ -80,8 +88,11 @@ class RunFolder:
         about = Run(self._folder, name, mermaid(self._graph), self._graph.settings_yaml(), self._live, senders)
         self._write(CONFIG_FILE, about.settings_yaml)
         with ExitStack() as opening:
+            folders = {id(results): self._folder / stage for stage, results in self._further.items()}
+            for folder in folders.values():
+                folder.mkdir(exist_ok=True)
             for tap in self.taps:
-                tap.open(about)
+                tap.open(replace(about, out_dir=folders.get(id(tap), self._folder)))
                 opening.callback(tap.close)
             self._open = opening.pop_all()
         return self
@@ -123,14 +134,13 @@ class RunFolder:
         self._open.close()
         if truth is None:
             truth = read_truth_file(self._recording)
-        truth.write(self._folder)
         result = RunResult(
             recording=self._recording,
             out_dir=self._folder,
             report=report,
             results=self._results,
-            errors=truth.fix_errors_of(self._results.fixes),
-            poses=read_fused_poses(self._folder, truth),
+            errors=None,
+            poses=None,
             output_hash=output_hash,
             wall_s=time.monotonic() - self._started_s,
             warnings=warnings,
@@ -138,8 +148,18 @@ class RunFolder:
             parts=parts,
             stage_outputs=_stage_outputs(self._graph, report),
         )
+        for stage, results in self._further.items():
+            self._finish_drone(replace(result, out_dir=self._folder / stage, results=results), truth)
+        return self._finish_drone(result, truth)
+
+    def _finish_drone(self, result: RunResult, truth: TruthLog) -> RunResult:
+        """The result of one drone with its errors; writes the truth and the summary into its folder."""
+        folder, results = result.out_dir, result.results
+        truth.write(folder)
+        errors, poses = truth.fix_errors_of(results.fixes), read_fused_poses(folder, truth)
+        result = replace(result, errors=errors, poses=poses)
         text = json.dumps(summary(result, self._request), indent=2)
-        self._write(SUMMARY_FILE, text + "\n")
+        self._write(str((folder / SUMMARY_FILE).relative_to(self._folder)), text + "\n")
         return result
 
 
@@ -157,7 +177,7 @@ def _stage_outputs(graph: Graph, report: RunReport) -> str:
 
 def _viewers(taps: list[Tap], gate: dict[str, Any]) -> list[Any]:
     """The viewers among the taps, with the gate's settings. Rerun is imported only where a graph has taps."""
-    if len(taps) == 1:
+    if all(isinstance(tap, Results) for tap in taps):
         return []
     from links.viewer import Viewer
     from links.viewer.scene import Gate
@@ -166,6 +186,13 @@ def _viewers(taps: list[Tap], gate: dict[str, Any]) -> list[Any]:
     for viewer in viewers:
         viewer.gate = Gate(**gate) if gate else None
     return viewers
+
+
+def _further_chains(graph: Graph) -> dict[str, frozenset[str]]:
+    """The stages of fused poses after the first, each with all nodes that feed it and not the first."""
+    fuses = [node for node, _, message in graph.outputs() if message is RelativePose]
+    feeding = {fuse: graph.feeding(fuse) for fuse in fuses}
+    return {fuse: feeding[fuse] - feeding[fuses[0]] for fuse in fuses[1:]}
 
 
 def _gate(graph: Graph) -> dict[str, Any]:

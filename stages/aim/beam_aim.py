@@ -4,7 +4,11 @@
     candidate                  point beams at it and around it until the detector has classified it, then continue
     TRACKING                   each rotor turn points one beam at the predicted position, with small alternating offsets
     COASTING                   the offsets grow with the uncertainty; above `coast_sigma_m` sweep
-    several drones             a few observations of each in turn; fewer than expected: a segment of the sweep between
+    several drones             a few observations of each, the longest unobserved first; fewer tracks than expected: a
+                               segment of the sweep between them
+
+Each drone has a chain of stages. That of the first has the ports `state` and `candidates`, the others `state_2`,
+`candidates_2` and so on. The tracks of two chains that follow one object count as one.
 
 The rotor's azimuth determines when it passes a direction next. The table moves between two passes and stands still
 during a pass, so that the offsets are chosen and do not depend on the beat of two periods. Of all beams that can be
@@ -50,6 +54,7 @@ FRESH_NS = 350_000_000  # a candidate with a return this recent may be observed 
 MAX_MISSED = 24  # missed observations that are remembered; older ones are obsolete, the drone moves
 HALF_DETECTION = 0.3  # of the span: a beam so far from its middle has half the detection probability
 RPM_RADPS = math.tau / 60.0
+MAX_DRONES = 8
 
 
 @dataclass(slots=True, eq=False)
@@ -95,7 +100,9 @@ class BeamAimSettings(Settings):
     max_missed: int = Field(8, ge=1, le=MAX_MISSED)  # consecutive misses of a candidate of probability 1; else fewer
     sweep_observations: int = Field(3, ge=0)  # of a candidate, without an interruption of the sweep
     observations_per_track: int = Field(3, ge=1)  # consecutive ones of each track, if there are several
-    max_drones: int = Field(1, ge=1, le=8)  # with fewer tracks the search continues between observations of tracks
+    max_drones: int = Field(
+        1, ge=1, le=MAX_DRONES
+    )  # expected, at least one a chain; with fewer tracks the search goes on
     search_s: float = Field(0.35, gt=0)  # duration of a search segment between observations of tracks
     beams: bool = True  # point a beam at the drone; False (ablation): the middle of the fan
     coast_sigma_m: float = Field(3.0, gt=0)  # a track with a larger position sigma is searched with the full sweep
@@ -108,9 +115,11 @@ class BeamAimSettings(Settings):
 
 
 class BeamAim(Stage[BeamAimSettings]):
-    """Keeps a beam on each tracked drone, and searches while there are fewer than `max_drones`."""
+    """Keeps a beam on each tracked drone, and searches while there are fewer than expected."""
 
-    optional_inputs: ClassVar[frozenset[str]] = frozenset({"candidates", "cue"})
+    optional_inputs: ClassVar[frozenset[str]] = frozenset({"candidates", "cue"}).union(
+        f"{port}_{chain}" for port in ("state", "candidates") for chain in range(2, MAX_DRONES + 1)
+    )
 
     def __init__(self, settings: BeamAimSettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
@@ -172,7 +181,7 @@ class BeamAim(Stage[BeamAimSettings]):
         state = self._state
         state.targets.expire(servo.stamp_ns, settings.max_observations, settings.cooldown_s)
         tracks = state.targets.tracks(settings.coast_sigma_m)
-        if not tracks or len(tracks) >= settings.max_drones:
+        if not tracks or len(tracks) >= max(settings.max_drones, len(state.targets.chains)):
             state.searching, state.track_observations, state.sweep.resume_rad = False, 0, None
         elif self._search_is_due(len(tracks), servo):
             return self._choose_candidate(servo.stamp_ns)
@@ -181,8 +190,7 @@ class BeamAim(Stage[BeamAimSettings]):
         current = state.targets.get(state.current)
         if current in tracks and (len(tracks) == 1 or state.consecutive < settings.observations_per_track):
             return current
-        after = [t for t in tracks if state.current is not None and t.key > state.current]
-        return (after or tracks)[0]
+        return min(tracks, key=lambda t: (t.observed_ns, t.key))
 
     def _search_is_due(self, track_count: int, servo: ServoState) -> bool:
         """Whether each track had `observations_per_track` observations, so that a segment of the sweep follows."""
@@ -274,7 +282,7 @@ class BeamAim(Stage[BeamAimSettings]):
             pass_ns = state.rotor.next_pass_ns(rotor_azimuth_rad(T_tl, p_turntable_m, best.table_rad), ready_ns)
         target.missed.append(MissedObservation(target.spread_m(pass_ns), offset_m))  # until it has a return
         del target.missed[:-MAX_MISSED]
-        target.observations += 1
+        target.observations, target.observed_ns = target.observations + 1, servo.stamp_ns
         state.track_observations += target.is_track
         result_ns = RESULT_NS + max(state.slice_ns - SLICE_NS, 0)
         state.hold_until_ns = max(pass_ns + result_ns, servo.stamp_ns + MIN_OBSERVATION_NS)
@@ -322,3 +330,21 @@ class BeamAim(Stage[BeamAimSettings]):
             return min(wanted_radps, limit_radps)
         turn_s = math.tau / state.rotor.rate_radps
         return min(sweep_step_rad(state.spacing_rad, wanted_radps * turn_s) / turn_s, limit_radps)
+
+
+def _add_ports(chain: int) -> None:
+    """Add the ports of a further drone's chain."""
+
+    def on_state(self: BeamAim, state: TrackState) -> None:
+        self._state.targets.update_track(state, chain)  # pyright: ignore[reportPrivateUsage]
+
+    def on_candidates(self: BeamAim, candidates: Candidates) -> None:
+        self._state.targets.update_candidates(candidates, self.settings.min_probability, chain)  # pyright: ignore[reportPrivateUsage]
+
+    for port, message, handler in (("state", TrackState, on_state), ("candidates", Candidates, on_candidates)):
+        handler.__annotations__ = {port: message, "return": None}  # the port's declaration, without `self`
+        setattr(BeamAim, f"on_{port}_{chain}", handler)
+
+
+for _chain in range(2, MAX_DRONES + 1):
+    _add_ports(_chain)

@@ -4,7 +4,7 @@ Its estimate is the truth with the errors of `drift`, in a local frame with its 
 any north. Like ArduPilot it sends HEARTBEAT, ATTITUDE, LOCAL_POSITION_NED, ODOMETRY (LOCAL_FRD, BODY_FRD), RAW_IMU (mg,
 mrad/s), with a receiver GPS_RAW_INT and GLOBAL_POSITION_INT, and a TIMESYNC request every 10 s, and replies to those of
 the host, which are recorded on /autopilot/tx. A message is sampled on the autopilot's clock, sent by its main loop a
-little later, and delayed by the radio.
+little later, and delayed by the radio. The autopilot of drone 2 has the topics /autopilot/rx_2 and /autopilot/tx_2.
 
 Differences to a real flight (copter log of dronekit over a SiK telemetry radio; ours is the link of a companion):
   MAVLink 1; each message at 2.7 Hz, no ODOMETRY, no TIMESYNC; 45 gaps, the longest 18.8 s; a reboot during the log
@@ -87,8 +87,11 @@ class Autopilot:
         duration_s: float,
         seed: int,
         receiver: DroneReceiver | None = None,
+        drone: int = 1,
     ) -> None:
+        """`drone`: its number, in the names of its topics."""
         self._settings = settings
+        self._received, self._sent = (f"/autopilot/{way}" + (f"_{drone}" if drone > 1 else "") for way in ("rx", "tx"))
         self._start_ns = start_ns
         self._mav = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
         self._host = mavlink.MAVLink(None, srcSystem=1, srcComponent=COMPANION)
@@ -127,17 +130,17 @@ class Autopilot:
         return round(1e9 * self._settings.boot_s) + since_ns + round(1e-6 * self._settings.clock_ppm * since_ns)
 
     def records(self, until_ns: int) -> list[Record]:
-        """Messages sent before `until_ns` that were not returned yet; /autopilot/rx is stamped with its arrival."""
+        """Messages sent before `until_ns` that were not returned yet; a received frame is stamped with its arrival."""
         records: list[Record] = []
         while self._requests and self._requests[-1][0] < until_ns:
             at_ns, frame = self._requests.pop()
-            records.append(Record("/autopilot/tx", arrival_ns=at_ns, stamp_ns=at_ns, data=frame))
+            records.append(Record(self._sent, arrival_ns=at_ns, stamp_ns=at_ns, data=frame))
         while self._waiting and self._waiting[-1][0] < until_ns:
             sent_ns, message = self._waiting.pop()
             frame = _packed(message, self._mav)
             arrival_ns = self._downlink.arrival_ns(sent_ns, len(frame))
             if arrival_ns is not None:
-                records.append(Record("/autopilot/rx", arrival_ns=arrival_ns, stamp_ns=arrival_ns, data=frame))
+                records.append(Record(self._received, arrival_ns=arrival_ns, stamp_ns=arrival_ns, data=frame))
         return records
 
     def _plan(

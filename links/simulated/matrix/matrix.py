@@ -19,7 +19,7 @@ import numpy as np
 from links.simulated.autopilot.autopilot import AutopilotSettings
 from links.simulated.matrix.flights import CAMERA_HEIGHT_M, Cell, drone_path, two_paths, vehicle_path
 from links.simulated.rig.perturbed_rig import PerturbedRig, draw_perturbed_rig
-from links.simulated.rig.scenario import DroneSettings, RigLidar, Scenario
+from links.simulated.rig.scenario import DroneSettings, OtherDroneSettings, RigLidar, Scenario
 from links.simulated.rig.scripted_servo import SweepSegment, VibrateSegment
 from links.simulated.sensors.camera import CameraSettings, CamerasSettings
 from links.simulated.sensors.lidar import LidarSettings
@@ -146,7 +146,7 @@ def scenario_of(cell: Cell, seed: int, conditions: Conditions | None = None) -> 
         ),
         vehicle={"camera_height_m": CAMERA_HEIGHT_M, "path": vehicle},  # pyright: ignore[reportArgumentType]
         drone=drones[0] if drones else None,
-        other_drones=drones[1:],
+        other_drones=tuple(OtherDroneSettings(**dict(drone)) for drone in drones[1:]),
         servo=SERVO,
         script=SWEEPS if cell.motion in SEARCHING else SWEEP_THEN_FOLLOW,
         truth_visible=bool(drones),

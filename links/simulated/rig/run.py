@@ -29,7 +29,7 @@ from links.simulated.rig.closed_loop import ClosedLoop, load_loop
 from links.simulated.rig.cue_sources import cue_sensors, drone_receiver
 from links.simulated.rig.flight_in_the_loop import FlightInTheLoop
 from links.simulated.rig.image_cache import CachedCamera, ImageCache, scenario_world
-from links.simulated.rig.scenario import Scenario, load_scenario
+from links.simulated.rig.scenario import OtherDroneSettings, Scenario, load_scenario
 from links.simulated.rig.scripted_servo import ServoScript
 from links.simulated.rig.truth_records import TruthRecords
 from links.simulated.sensors.camera import Camera, build_cameras
@@ -47,6 +47,7 @@ from links.simulated.world.suspension import SuspendedPath
 from links.simulated.world.vehicle import vehicle_mesh, vehicle_mesh_from_camera
 from stages.geometry.frames import Array64
 
+OTHER_SEEDS = 1_000_003  # between the seeds of two drones' gusts and sensor errors
 BATCH_PACKETS = 32  # pulses are cast in batches; their size changes no byte
 
 
@@ -105,8 +106,8 @@ class Simulation:
             self.telemetry_sources.append(odometry)
         if (cues := cue_sensors(self.scenario, vehicle_motion, drone_motion)) is not None:
             self.telemetry_sources.append(cues)
-        others = tuple(other.path for other in scenario.other_drones)
-        self.truth = Truth(start_ns, vehicle_motion, drone_motion, others)
+        others = [self._other_motion(number, other) for number, other in enumerate(scenario.other_drones, 2)]
+        self.truth = Truth(start_ns, vehicle_motion, drone_motion, tuple(others))
         self._scene = _scene(self.scenario, self.truth)
         self._check_paths()
         if self.flight is not None:
@@ -156,6 +157,16 @@ class Simulation:
         motion = Flight(drone.path, autopilot.flight, duration_s, self.seed)
         receiver = drone_receiver(scenario, motion)
         self.telemetry_sources.append(Autopilot(autopilot, motion, start_ns, duration_s, self.seed, receiver))
+        return motion
+
+    def _other_motion(self, number: int, drone: OtherDroneSettings) -> Path | Flight:
+        """The motion of drone 2, 3, ...: its path, or a flight along it. Adds its autopilot."""
+        if drone.autopilot is None:
+            return drone.path
+        start_ns, duration_s, seed = self.scenario.start_ns, self.scenario.duration_s, self.seed + number * OTHER_SEEDS
+        motion = Flight(drone.path, drone.autopilot.flight, duration_s, seed)
+        autopilot = Autopilot(drone.autopilot, motion, start_ns, duration_s, seed, drone=number)
+        self.telemetry_sources.append(autopilot)
         return motion
 
     def _rendered_cameras(self) -> list[Camera]:

@@ -60,6 +60,19 @@ class DroneSettings(StrictModel):
     path: Path
 
 
+class OtherDroneSettings(DroneSettings):
+    """A further drone. With an autopilot it obeys flight dynamics and sends telemetry, as the first one does."""
+
+    autopilot: AutopilotSettings | None = None
+
+    @field_validator("autopilot")
+    @classmethod
+    def _is_not_in_the_loop(cls, value: AutopilotSettings | None) -> AutopilotSettings | None:
+        if value is not None and value.flight_stack is not None:
+            raise ValueError("flight_stack: only the first drone flies on what grd sends")
+        return value
+
+
 class RigLidar(rig_lidar.RigLidar):
     """The LiDAR on its turntable, as in the rig file. An Ouster without beams gets evenly spaced ones."""
 
@@ -97,7 +110,7 @@ class Scenario(StrictModel):
     weather: Weather = Weather()
     vehicle: VehicleSettings = VehicleSettings()
     drone: DroneSettings | None = None
-    other_drones: tuple[DroneSettings, ...] = Field(default=(), max_length=9)  # follow their paths exactly
+    other_drones: tuple[OtherDroneSettings, ...] = Field(default=(), max_length=9)
     lidar: LidarSettings = LidarSettings()
     servo: ServoSettings = ServoSettings()
     cameras: CamerasSettings = CamerasSettings()

@@ -40,7 +40,7 @@ class Truth:
     start_ns: int
     vehicle: Path | SuspendedPath  # a path stays level, a suspended path pitches and rolls
     drone: Path | Flight | FlownMotion | None  # followed exactly; with its own dynamics; flown by an autopilot
-    others: tuple[Path, ...] = ()  # drones 2, 3, ...
+    others: tuple[Path | Flight, ...] = ()  # drones 2, 3, ...
 
     def seconds(self, stamp_ns: NDArray[np.int64]) -> Array64:
         """Time since the start [s]."""

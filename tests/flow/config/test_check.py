@@ -319,6 +319,44 @@ def test_a_lens_of_another_model_replaces_all_numbers(tmp_path):
     ]
 
 
+def test_an_include_copies_some_nodes_under_other_names(tmp_path):
+    (tmp_path / "base.yaml").write_text(GRAPH)
+    text = "include: [base.yaml, {file: base.yaml, nodes: [double, add], suffix: _2}]\n"
+    (tmp_path / "x.yaml").write_text(text + "stages:\n  double_2: {config: {factor: 5}}\n")
+    graph = load_graph(tmp_path / "x.yaml")
+    assert set(graph.nodes) == {"numbers", "double", "add", "double_2", "add_2"}
+    assert {(e.producer, e.consumer, e.port) for e in graph.edges if e.consumer.endswith("_2")} == {
+        ("numbers", "double_2", "number"),
+        ("numbers", "add_2", "left"),
+        ("double_2", "add_2", "right"),
+    }
+    assert graph.nodes["double_2"].config == {"factor": 5}
+    assert graph.nodes["double"].config != {"factor": 5}
+
+
+@pytest.mark.parametrize(
+    ("entry", "error"),
+    [
+        (
+            "{file: base.yaml, nodes: [dubble], suffix: _2}",
+            "x.yaml:1: include: 'base.yaml' has no stage or link 'dubble'. Did you mean 'double'?",
+        ),
+        (
+            "{file: base.yaml, suffix: _2}",
+            "x.yaml:1: include: must be a file name, {file: ..., nodes: [...], suffix: ...}, or a list of them, "
+            "got {'file': 'base.yaml', 'suffix': '_2'}.",
+        ),
+        (
+            "{file: bse.yaml, nodes: [], suffix: _2}",
+            "x.yaml:1: include: no such file 'bse.yaml'. Did you mean 'base.yaml'?",
+        ),
+    ],
+)
+def test_a_copy_that_is_impossible_is_an_error(tmp_path, entry, error):
+    (tmp_path / "base.yaml").write_text(GRAPH)
+    assert only_error(tmp_path, f"include: [base.yaml, {entry}]\n") == error
+
+
 def test_the_including_file_is_on_top_and_errors_name_the_included_file(tmp_path):
     (tmp_path / "base.yaml").write_text(GRAPH.replace("{name: adder}", "{name: adder, window: 0}"))
     found = only_error(tmp_path, "include: base.yaml\nstages:\n  double: {config: {factor: 5}}\n")

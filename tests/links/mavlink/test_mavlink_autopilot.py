@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pydantic import ValidationError
 from pymavlink.dialects.v20 import ardupilotmega
 
 from flow.link import Record
@@ -456,3 +457,12 @@ def test_a_real_log_decodes_with_increasing_stamps_before_arrival(
     assert link.counters["clock restarts"] == restarts
     assert 0.97 * attitudes < counts[DroneAttitude] <= attitudes
     assert link.counters.get("rejected: damaged", 0) == damaged
+
+
+def test_the_link_of_a_second_autopilot_has_its_own_topics_and_state_file():
+    settings = Autopilot(topic="/autopilot/rx_2", state_file=Path("out/sent.json")).settings
+    assert (settings.sent_topic, settings.own_state_file) == ("/autopilot/tx_2", Path("out/sent_2.json"))
+    first = Autopilot(state_file=Path("out/sent.json")).settings
+    assert (first.sent_topic, first.own_state_file) == ("/autopilot/tx", Path("out/sent.json"))
+    with pytest.raises(ValidationError):
+        Autopilot(topic="/autopilot")

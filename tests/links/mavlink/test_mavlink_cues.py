@@ -10,7 +10,6 @@ from pymavlink.dialects.v20 import ardupilotmega
 
 from flow.link import Record
 from links.mavlink import Autopilot
-from links.mavlink.autopilot import SENT_TOPIC
 from stages.messages import DroneGlobalPosition, DroneGnss, UwbRange
 from tests.links.mavlink.test_mavlink_autopilot import HOST0, MS, Sender, record
 
@@ -60,7 +59,7 @@ def test_the_autopilots_position_is_marked_once_a_pose_was_sent_and_the_receiver
         0, 20, 12, 1.0, 2.0, 3.0, [1, 0, 0, 0], 0, 0, 0, 0, 0, 0, [0.0] * 21, [0.0] * 21, 0, 0, 0
     )
     at_ns = HOST0 + 100 * MS
-    autopilot.decode(Record(SENT_TOPIC, at_ns, at_ns, Sender(component=197).frame(pose)))
+    autopilot.decode(Record("/autopilot/tx", at_ns, at_ns, Sender(component=197).frame(pose)))
     after = autopilot.decode(record(sender.frame(position(1200)), 200.0))
     assert isinstance(after, DroneGlobalPosition)
     assert not after.independent

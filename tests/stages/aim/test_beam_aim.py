@@ -325,11 +325,11 @@ def test_after_a_loss_it_sweeps_again():
 def test_a_cooldown_does_not_apply_to_the_same_id_of_another_detector_instance():
     targets, position_m = Targets(), (0.0, 8.0, 10.0)
     targets.update_candidates(candidates(position_m, 0.0, 0.5, scan_passes=6), 0.1)
-    targets.exclude(targets.by_key["candidate", 1], START_NS, cooldown_s=10.0)
+    targets.exclude(targets.by_key["candidate", 1, 1], START_NS, cooldown_s=10.0)
     targets.update_candidates(candidates(position_m, 1.0, 0.5, scan_passes=7), 0.1)
     assert not targets.by_key
     targets.update_candidates(candidates(position_m, 2.0, 0.5, scan_passes=9, detector_instance=START_NS + 1), 0.1)
-    assert list(targets.by_key) == [("candidate", 1)]
+    assert list(targets.by_key) == [("candidate", 1, 1)]
 
 
 @pytest.mark.parametrize("reported", [True, False])
@@ -516,6 +516,62 @@ def test_while_fewer_drones_than_expected_are_tracked_the_search_continues_betwe
     met = np.nonzero(two.missed_m(trajectory)[10:] < 0.25)[0]
     assert len(met) > 8  # of 40
     assert np.diff(met).max() <= 16  # observed again within 1.6 s: the movement there, `search_s` and the movement back
+
+
+def in_chains(*trajectories: Trajectory) -> Publisher:
+    """Publish each drone's position at 10 Hz as track 1 of a chain of its own."""
+
+    def publish(aim, t_s):
+        if round(t_s * 1000) % 100 == 0:
+            for chain, trajectory in enumerate(trajectories, 1):
+                getattr(aim, "on_state" if chain == 1 else f"on_state_{chain}")(track_state(trajectory, t_s))
+
+    return publish
+
+
+@pytest.mark.parametrize("count", [2, 4, 8])
+def test_the_drone_of_each_chain_is_observed_again_before_its_track_is_lost(count):
+    trajectories = [towards(10.0 + 340.0 * k / count, 45.0) for k in range(count)]
+    flight = fly(BeamAim(mount=ON_ITS_SIDE), 12.0, in_chains(*trajectories), start_rad=0.5)
+    for trajectory in trajectories:
+        met = np.nonzero(flight.missed_m(trajectory) < 0.25)[0]
+        assert np.diff([0, *met, 120]).max() <= 50  # turns of 0.1 s; a track is lost after 6 s
+
+
+def test_chains_that_follow_one_object_do_not_end_the_search():
+    one, other = towards(60.0, 45.0), towards(160.0, 45.0)
+    same = fly(BeamAim(mount=ON_ITS_SIDE), 4.0, in_chains(one, one), start_rad=1.0)
+    two = fly(BeamAim(mount=ON_ITS_SIDE), 4.0, in_chains(one, other), start_rad=1.0)
+    ends = [[t for t, goal in flight.goals[1:] if goal.position_rad in (0.0, math.pi)] for flight in (same, two)]
+    assert len(ends[0]) > 2
+    assert ends[1] == []
+
+
+def test_a_chain_without_a_track_does_not_end_the_track_of_another_and_is_searched_for():
+    trajectory, aim = towards(60.0, 45.0), BeamAim(mount=ON_ITS_SIDE)
+    idle = track_state(trajectory, 0.0, TrackingState.SEARCHING, track_id=0)
+
+    def publish(aim, t_s):
+        tracking(trajectory)(aim, t_s)
+        if round(t_s * 1000) % 500 == 0:
+            stamp_ns = START_NS + round(t_s * 1e9)
+            aim.on_state_2(replace(idle, stamp_ns=stamp_ns, xyz_vehicle_m=None, velocity_vehicle_mps=None))
+
+    flight = fly(aim, 5.0, publish, start_rad=1.0)
+    assert np.degrees(np.ptp(flight.servo_rad[100:])) > 90.0
+    met = np.nonzero(flight.missed_m(trajectory)[10:] < 0.25)[0]
+    assert len(met) > 8  # of 40
+    assert np.diff(met).max() <= 16
+
+
+def test_equal_ids_of_two_chains_are_two_candidates():
+    targets = Targets()
+    targets.update_candidates(candidates((0.0, 8.0, 10.0), 0.0, 0.5), 0.1)
+    targets.update_candidates(candidates((9.0, 1.0, 10.0), 0.0, 0.5, detector_instance=START_NS + 1), 0.1, chain=2)
+    assert list(targets.by_key) == [("candidate", 1, 1), ("candidate", 2, 1)]
+    targets.exclude(targets.by_key["candidate", 2, 1], START_NS, cooldown_s=10.0)
+    targets.update_candidates(candidates((0.0, 8.0, 10.0), 1.0, 0.5), 0.1)
+    assert list(targets.by_key) == [("candidate", 1, 1)]
 
 
 def test_a_longer_search_segment_is_wider():

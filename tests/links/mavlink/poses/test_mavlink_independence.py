@@ -12,7 +12,6 @@ from pymavlink.dialects.v20 import ardupilotmega
 from flow.link import Record
 from links.clock import host_time
 from links.mavlink import Autopilot
-from links.mavlink.autopilot import SENT_TOPIC
 from links.mavlink.poses.independence import Independence
 from tests.links.mavlink.mavlink_poses import good_pose
 from tests.links.mavlink.test_mavlink_live import listening
@@ -45,7 +44,7 @@ class Flight:
     def send(self, at_ms: int, message: Any = POSE) -> None:
         """A frame of ours in the recording."""
         at_ns = HOST0 + at_ms * MS
-        assert self.link.decode(Record(SENT_TOPIC, at_ns, at_ns, bytes(message.pack(self._own)))) is None
+        assert self.link.decode(Record("/autopilot/tx", at_ns, at_ns, bytes(message.pack(self._own)))) is None
 
 
 def landing_target() -> Any:

@@ -12,7 +12,10 @@ from pydantic import ValidationError
 
 from flow.link import LinkError, Record
 from links.lidar import Lidar
+from links.mavlink import Autopilot
+from links.runs.request import RunRequest
 from links.runs.results import TRUTH_FILE, TRUTH_RETURNS_FILE, TRUTH_VEHICLE_FILE, TRUTH_VISIBLE_FILE
+from links.runs.run_folder import replay_into
 from links.runs.truth import TruthLog
 from links.simulated.kernels.lidar import echoes
 from links.simulated.rig import run
@@ -24,6 +27,7 @@ from links.simulated.world.mesh import RayScene, box
 from links.simulated.world.path import Path, Waypoint
 from links.simulated.world.scene import Scene, Truth, drone_shapes
 from links.simulated.world.vehicle import vehicle_mesh
+from stages.messages import DroneLocalPosition
 
 STREET = FilePath(__file__).parents[4] / "configs/scenarios/street_sweep.yaml"
 ASIDE = {"span_m": 0.8, "model": {"shape": "hexa"}, "path": {"waypoints": [{"t_s": 0, "xyz_m": [-4.0, -2.0, 7.0]}]}}
@@ -47,6 +51,12 @@ def pair() -> Scenario:
         servo={"start_deg": 26.57},
         script=[{"do": "vibrate", "duration_s": 60.0, "azimuth_table": [[0.0, 26.57]]}],
     )
+
+
+@pytest.fixture(scope="module")
+def own_telemetry(pair: Scenario) -> Scenario:
+    """The same, each drone with an autopilot."""
+    return pair.changed(autopilot={}, other_drones=[{**ASIDE, "autopilot": {"boot_s": 50.0}}], truth_visible=False)
 
 
 def content(records: list[Record], topic: str) -> list[dict[str, Any]]:
@@ -203,3 +213,41 @@ def test_the_recorded_truth_is_what_a_run_is_evaluated_with(pair: Scenario, tmp_
     assert (tmp_path / "truth_visible.csv").read_text() == "stamp_s,visible\n1748773230.000000000,1\n"
     last = (tmp_path / "truth_vehicle_drone_2.tum").read_text().splitlines()[-1].split()
     assert [float(v) for v in last[1:4]] == [-4.0, -2.0, 7.0]
+
+
+def test_each_drone_with_an_autopilot_has_topics_of_its_own(own_telemetry: Scenario) -> None:
+    alone = own_telemetry.changed(other_drones=[ASIDE])
+    both, first = (
+        [record for record in Simulation(s).records() if record.topic.startswith("/autopilot/")]
+        for s in (own_telemetry, alone)
+    )
+    second = [record for record in both if record.topic.endswith("_2")]
+    assert {record.topic for record in second} == {"/autopilot/rx_2", "/autopilot/tx_2"}
+    assert plain([record for record in both if record not in second]) == plain(first)
+    links = {number: Autopilot(topic=f"/autopilot/rx{number}") for number in ("", "_2")}
+    heights_m: dict[str, list[float]] = {number: [] for number in links}
+    for record in both:
+        for number, link in links.items():
+            message = link.decode(record) if record.topic in link.replay_topics else None
+            if isinstance(message, DroneLocalPosition):
+                heights_m[number].append(message.xyz_odom_m[2])
+    assert min(len(heights) for heights in heights_m.values()) > 5
+    assert heights_m[""] != heights_m["_2"]
+
+
+def test_only_the_first_drone_flies_on_what_grd_sends(pair: Scenario) -> None:
+    with pytest.raises(ValidationError, match="only the first drone flies on what grd sends"):
+        pair.changed(other_drones=[{**ASIDE, "autopilot": {"flight_stack": {}}}])
+
+
+def test_a_run_with_two_chains_has_a_folder_for_each(own_telemetry: Scenario, tmp_path: FilePath) -> None:
+    recording, request = (
+        tmp_path / "pair.mcap",
+        RunRequest(FilePath("configs/two_drones.yaml"), (), ("viewer.file=null",)),
+    )
+    run.simulate_into(recording, own_telemetry)
+    result = replay_into(tmp_path / "run", recording, request)
+    own, other = (json.loads((tmp_path / name / "summary.json").read_text()) for name in ("run", "run/fuse_2"))
+    assert sum(own["poses"]["states"].values()) == result.report.messages["fuse.relative_pose"]
+    assert sum(other["poses"]["states"].values()) == result.report.messages["fuse_2.relative_pose"] > 10
+    assert "fuse_2." not in (tmp_path / "run/run.log").read_text()

@@ -16,7 +16,11 @@ MERGE_PX = 0.8  # largest distance of an arc's ends from the great circle of its
 
 
 def cluster(arcs: Arcs, pixel_rays: PixelRays, max_lines: int) -> Arcs:
-    """The `max_lines` longest lines, longest first."""
+    """The `max_lines` longest lines, longest first.
+
+    From the longest on, each arc takes the shorter ones whose ends are within MERGE_PX of its great circle and near its
+    own ends along it; a line is fitted to the rays of all its arcs.
+    """
     if len(arcs) == 0:
         return arcs
     lines = gather(arcs.longest().rows, MERGE_PX * pixel_rays.pixel_rad, MIN_SIGMA_PX * pixel_rays.pixel_rad)

@@ -23,12 +23,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.geometry.frames import rotation_z
 from stages.geometry.lens import Array64
-from stages.kernels.vp.rivals import agreement_of_parts, equal_parts, turn_between
+from stages.kernels.geometry.so3 import log_rotation
+from stages.kernels.vp.rivals import agreement_of_parts, equal_parts
+from stages.kernels.vp.spectrum import APART_RAD
 from stages.vp.directions import Lines
 
 RIVAL_RAD = math.radians(3.0)  # a vertical farther than this from the best one is another answer
 RIVAL_LEVEL = 0.05  # significance level, one-sided
+QUARTERS = np.array([rotation_z(k * math.pi / 2) for k in range(4)])
 SAME_RAD = math.radians(0.5)  # structures nearer than this are one
 
 
@@ -74,6 +78,19 @@ def compare(lines: Lines, axes: Array64, others: Sequence[Array64], sigma_model:
     return Rivals(
         tuple(sorted(answers, key=lambda answer: -answer[1])), np.array(turns).reshape(-1, 3), w / (1.0 + w.sum())
     )
+
+
+def turn_between(axes: Array64, other: Array64) -> Array64:
+    """Rotation vector (3,) from one Manhattan frame to another, in the axes of the first, modulo 90 deg of yaw.
+
+    Frames with yaws APART_RAD and more apart are different pairs: the rotation is that of the vertical alone.
+    """
+    R = axes.T @ other
+    quarters = round(math.atan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1]) / (math.pi / 2))
+    turn = log_rotation(np.ascontiguousarray(R @ QUARTERS[-quarters % 4]))
+    if abs(turn[2]) < APART_RAD:
+        return turn
+    return np.array([-R[1, 2], R[0, 2], 0.0])
 
 
 def probability_better(difference: Array64) -> float:

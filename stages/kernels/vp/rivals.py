@@ -12,9 +12,7 @@ from numpy.typing import NDArray
 
 from stages.geometry.lens import Array64
 from stages.kernels.compiled import compiled_at_once
-from stages.kernels.geometry.so3 import log_rotation
 from stages.kernels.vp.directions import GATE, NONE, PARTS, all_directions, assign_kernel
-from stages.kernels.vp.spectrum import APART_RAD
 
 
 @compiled_at_once("(float64[:, ::1], float64[:, ::1], float64[::1], float64[:, ::1])")
@@ -65,18 +63,3 @@ def agreement_of_parts(
         if assigned[i] != NONE:
             out[part[i]] += weight[i] * max(1.0 - (r[i] / (GATE * spread[i])) ** 2, 0.0)
     return out
-
-
-@compiled_at_once("(float64[:, :], float64[:, :])")
-def turn_between(axes: Array64, other: Array64) -> Array64:
-    """Rotation vector (3,) from one Manhattan frame to another, in the axes of the first, modulo 90 deg of yaw.
-
-    Frames with yaws APART_RAD and more apart are different pairs: the rotation is that of the vertical alone.
-    """
-    R = np.ascontiguousarray(axes.T) @ np.ascontiguousarray(other)
-    nearest = R.copy()
-    for _ in range(round(math.atan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1]) / (math.pi / 2)) % 4):
-        x = nearest[:, 0].copy()  # a yaw of -90 deg
-        nearest[:, 0], nearest[:, 1] = -nearest[:, 1], x
-    turn = log_rotation(nearest)
-    return turn if abs(turn[2]) < APART_RAD else np.array([-R[1, 2], R[0, 2], 0.0])

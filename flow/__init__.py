@@ -1,5 +1,35 @@
-"""The stage-graph engine: YAML in, checked graph, deterministic run. It knows nothing about drones."""
+"""The stage-graph engine: YAML in, checked graph, deterministic run. It knows nothing about drones.
 
-from flow.linear_algebra import use_portable_kernel
+It selects the same floating-point kernels on every x86-64 processor with AVX2, so that a replay gives the same bits.
+OpenBLAS and numpy select theirs by the processor, and those for AVX-512 round differently: sums are in another order,
+and exp, log, sin and cos are other polynomials.
+"""
 
-use_portable_kernel()  # before numpy is imported
+from __future__ import annotations
+
+import os
+import platform
+from collections.abc import MutableMapping
+from pathlib import Path
+
+CPU_INFO = Path("/proc/cpuinfo")
+OPENBLAS, NUMPY = "OPENBLAS_CORETYPE", "NPY_DISABLE_CPU_FEATURES"  # read when numpy or scipy is loaded
+NUMPY_KERNELS = {"avx512f": "X86_V4", "avx512_vbmi2": "AVX512_ICL", "avx512_fp16": "AVX512_SPR"}  # flag: kernels
+
+
+def use_portable_kernels(environment: MutableMapping[str, str] = os.environ, cpu_info: Path = CPU_INFO) -> None:
+    """Select the kernels for AVX2 where the processor has it, unless the environment selects others.
+
+    Without effect on what is loaded already. Child processes inherit it.
+    """
+    if platform.machine() not in ("x86_64", "AMD64") or not cpu_info.exists():
+        return
+    flags = set(cpu_info.read_text(errors="replace").split())
+    if "avx2" not in flags:
+        return
+    environment.setdefault(OPENBLAS, "Haswell")
+    if disabled := [kernels for flag, kernels in NUMPY_KERNELS.items() if flag in flags]:
+        environment.setdefault(NUMPY, " ".join(disabled))
+
+
+use_portable_kernels()

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stages.geometry.lens import Array64
-from stages.kernels.vp.arcs import EXTENT, FIRST, MOMENTS, NORMAL, SIGMA, split_all
+from stages.kernels.vp.arcs import EXTENT, FIRST, NORMAL, SIGMA, split_all
 from stages.vp.edges import Chains
 from stages.vp.pixel_rays import PixelRays
 
@@ -28,14 +28,34 @@ MIN_SIGMA_PX = 0.12  # position noise of an edge point; blur, sampling, JPEG
 class Arcs:
     """Great-circle arcs, or lines made of several. All vectors unit, camera frame."""
 
-    normal: Array64  # (n, 3)
-    ends: Array64  # (n, 2, 3) on the circle
-    sigma_rad: Array64  # (n,) of the rotation about its middle ray
-    extent_rad: Array64  # (n,) angle between the ends
-    moments: Array64  # (n, 7) second moments xx, xy, xz, yy, yz, zz of its rays, and their number
+    rows: Array64  # (n, COLUMNS) table of the compiled functions
 
     def __len__(self) -> int:
-        return len(self.normal)
+        return len(self.rows)
+
+    @property
+    def normal(self) -> Array64:
+        """Normals (n, 3) of the great circles."""
+        return np.ascontiguousarray(self.rows[:, NORMAL : NORMAL + 3])
+
+    @property
+    def ends(self) -> Array64:
+        """Both ends (n, 2, 3), on the circle."""
+        return np.ascontiguousarray(self.rows[:, FIRST : FIRST + 6]).reshape(-1, 2, 3)
+
+    @property
+    def sigma_rad(self) -> Array64:
+        """Sigma (n,) of the rotation about its middle ray."""
+        return np.ascontiguousarray(self.rows[:, SIGMA])
+
+    @property
+    def extent_rad(self) -> Array64:
+        """Angle (n,) between the ends."""
+        return np.ascontiguousarray(self.rows[:, EXTENT])
+
+    def longest(self, count: int | None = None) -> Arcs:
+        """The `count` longest of them, or all, longest first."""
+        return Arcs(self.rows[np.argsort(-self.rows[:, EXTENT], kind="stable")[:count]])
 
 
 def fit_arcs(
@@ -53,17 +73,4 @@ def fit_arcs(
     tolerance, extent = tolerance_px * pixel_rays.pixel_rad, min_extent_px * pixel_rays.pixel_rad
     min_sigma, middle = MIN_SIGMA_PX * pixel_rays.pixel_rad, 0.5 * (pixel_rays.usable.shape[0] - 1)
     turn = np.zeros(3) if turn_rad_per_row is None else turn_rad_per_row
-    return arcs_of(
-        split_all(chains.points_px, chains.start, pixel_rays.rays, tolerance, extent, min_sigma, turn, middle)
-    )
-
-
-def arcs_of(rows: Array64) -> Arcs:
-    """Arcs from the table that the compiled functions write."""
-    return Arcs(
-        normal=np.ascontiguousarray(rows[:, NORMAL : NORMAL + 3]),
-        ends=np.ascontiguousarray(rows[:, FIRST : FIRST + 6]).reshape(-1, 2, 3),
-        sigma_rad=rows[:, SIGMA].copy(),
-        extent_rad=rows[:, EXTENT].copy(),
-        moments=np.ascontiguousarray(rows[:, MOMENTS:]),
-    )
+    return Arcs(split_all(chains.points_px, chains.start, pixel_rays.rays, tolerance, extent, min_sigma, turn, middle))

@@ -8,31 +8,20 @@ Source: ours. DESIGN, Vision: cluster lines.
 
 from __future__ import annotations
 
-import numpy as np
-
 from stages.kernels.vp.clustering import gather
-from stages.vp.arcs import MIN_SIGMA_PX, Arcs, arcs_of
+from stages.vp.arcs import MIN_SIGMA_PX, Arcs
 from stages.vp.pixel_rays import PixelRays
 
 MERGE_PX = 0.8  # largest distance of an arc's ends from the great circle of its line
 
 
 def cluster(arcs: Arcs, pixel_rays: PixelRays, max_lines: int) -> Arcs:
-    """The `max_lines` longest lines, longest first."""
+    """The `max_lines` longest lines, longest first.
+
+    From the longest on, each arc takes the shorter ones whose ends are within MERGE_PX of its great circle and near its
+    own ends along it; a line is fitted to the rays of all its arcs.
+    """
     if len(arcs) == 0:
         return arcs
-    order = np.argsort(-arcs.extent_rad, kind="stable")
-    rows = gather(
-        arcs.normal[order],
-        arcs.ends[order],
-        arcs.sigma_rad[order],
-        arcs.extent_rad[order],
-        arcs.moments[order],
-        MERGE_PX * pixel_rays.pixel_rad,
-        MIN_SIGMA_PX * pixel_rays.pixel_rad,
-    )
-    lines = arcs_of(rows)
-    keep = np.argsort(-lines.extent_rad, kind="stable")[:max_lines]
-    return Arcs(
-        lines.normal[keep], lines.ends[keep], lines.sigma_rad[keep], lines.extent_rad[keep], lines.moments[keep]
-    )
+    lines = gather(arcs.longest().rows, MERGE_PX * pixel_rays.pixel_rad, MIN_SIGMA_PX * pixel_rays.pixel_rad)
+    return Arcs(lines).longest(max_lines)

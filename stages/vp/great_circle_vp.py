@@ -124,7 +124,7 @@ class GreatCircleVp(Stage[GreatCircleVpSettings]):
         )
         lines = lines_of(arcs, R, FULL_WEIGHT_RAD)
         found = find_structure(lines, self._prior(image.stamp_ns), self._limits())
-        return self._message(image.stamp_ns, found, lines.normal, arcs.ends @ R.T, arcs.sigma_rad)
+        return self._message(image.stamp_ns, found, lines.normal, arcs.ends @ R.T, lines.sigma_rad)
 
     def _rate_radps(self, stamp_ns: int) -> Array64:
         """Angular rate (3,) of the mount, mount axes; zero when it is unknown."""

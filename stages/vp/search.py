@@ -138,9 +138,10 @@ def _frames(lines: Lines, axes: Array64, limits: SearchLimits) -> tuple[list[flo
         peak = int(np.argmax(np.where(allowed, spectrum.score, -np.inf)))
         yaw, score = float(spectrum.yaw_rad[peak]) if yaws else 0.0, float(spectrum.score[peak])
         first_score = first_score if yaws else score
+        if score < limits.min_score + (FURTHER_SCORE if yaws else 0.0):
+            break
         near = _near(lines, axes, yaw, limits) & free
-        more = FURTHER_SCORE if yaws else 0.0
-        if score < limits.min_score + more or near.sum() < limits.min_lines * (1.5 if yaws else 1.0):
+        if near.sum() < limits.min_lines * (1.5 if yaws else 1.0):
             break
         direction, elsewhere = pair_support(lines, axes, free, limits.sigma_model, yaw) if yaws else (np.inf, np.inf)
         if direction >= limits.min_direction_score and elsewhere >= limits.min_elsewhere_score:

@@ -149,7 +149,7 @@ def _nearest(direction: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.n
 def corridor() -> str:
     """Angles between the directions in the real corridor, each by its own lines alone; the building's are right.
 
-    Also by the lines within 80 and 70 deg of the axis alone: a lens is seldom calibrated well at its rim.
+    Also by the lines within 80 and 70 deg of the axis alone, with the sigma of each angle by resampling the lines.
     """
     folder = DATA / "fisheye"
     if not folder.exists():
@@ -162,16 +162,24 @@ def corridor() -> str:
     middle = found.line_end.sum(axis=1)
     middle /= np.linalg.norm(middle, axis=1, keepdims=True)
     along_axis = middle @ vp.settings.T_mount_camera.matrix()[:3, 2]
-    texts = []
-    for limit_deg in (180.0, 80.0, 70.0):
-        used = along_axis > math.cos(math.radians(limit_deg))
-        own = [used & (found.line_direction == k) for k in range(len(found.direction))]
+
+    def off_square(lines: np.ndarray) -> np.ndarray:
+        """Angles (3,) off square [deg] by the lines with these indices."""
+        own = [lines[found.line_direction[lines] == k] for k in range(len(found.direction))]
         d = [
             _by_own_lines(found.line_normal[mine], middle[mine], found.line_sigma_rad[mine], extent_rad[mine], start)
             for mine, start in zip(own, found.direction, strict=True)
         ]
-        off = [90.0 - math.degrees(math.acos(abs(float(d[i] @ d[j])))) for i in range(len(d)) for j in range(i)]
-        texts.append(f"within {limit_deg:.0f} deg of the axis {', '.join(f'{angle:.2f}' for angle in off)}")
+        d = [own * np.sign(own @ start) for own, start in zip(d, found.direction, strict=True)]
+        return np.array([90.0 - math.degrees(math.acos(d[i] @ d[j])) for i in range(len(d)) for j in range(i)])
+
+    texts, rng = [], np.random.default_rng(0)
+    for limit_deg in (180.0, 80.0, 70.0):
+        used = np.flatnonzero(along_axis > math.cos(math.radians(limit_deg)))
+        sigma = np.std([off_square(rng.choice(used, len(used))) for _ in range(200)], axis=0)
+        angles = ", ".join(f"{abs(a):.2f} (sigma {s:.2f})" for a, s in zip(off_square(used), sigma, strict=True))
+        numbers = np.bincount(found.line_direction[used] + 1)[1:]
+        texts.append(f"within {limit_deg:.0f} deg of the axis, {numbers} lines, {angles}")
     sigma = ", ".join(f"{s:.2f}" for s in np.degrees(found.sigma_rad))
     return f"corridor: off a right angle, each direction by its own lines {'; '.join(texts)} deg; sigma {sigma} deg"
 

@@ -73,9 +73,10 @@ def _rays(table: NDArray[np.float32], points: NDArray[np.float32], out: Array64)
     x, y, z = out[0], out[1], out[2]
     for i in range(len(points)):
         at_x, at_y = points[i, 0] / STEP_PX, points[i, 1] / STEP_PX
-        column, row = np.uint64(at_x), np.uint64(at_y)  # unsigned: avoids the check for negative indices
+        left, above = np.int32(at_x), np.int32(at_y)
+        u, v = at_x - left, at_y - above
+        column, row = np.uint64(left), np.uint64(above)  # unsigned: avoids the check for negative indices
         right, below = column + np.uint64(1), row + np.uint64(1)
-        u, v = at_x - np.float64(column), at_y - np.float64(row)
         a, b, c, d = (1.0 - u) * (1.0 - v), u * (1.0 - v), (1.0 - u) * v, u * v
         one, two, three, four = table[row, column], table[row, right], table[below, column], table[below, right]
         x[i] = a * one[0] + b * two[0] + c * three[0] + d * four[0]

@@ -11,30 +11,42 @@ import numpy as np
 
 from stages.geometry.lens import Array64
 from stages.kernels.compiled import compiled
-from stages.kernels.vp.arcs import COLUMNS, WIDEST_RAD, Moments, Vector, cross, dot, fit_moments
+from stages.kernels.vp.arcs import (
+    COLUMNS,
+    EXTENT,
+    FIRST,
+    MOMENTS,
+    NORMAL,
+    SIGMA,
+    WIDEST_RAD,
+    Moments,
+    Vector,
+    cross,
+    dot,
+    fit_moments,
+)
 
 TOGETHER_SIGMAS = 2.0  # additional tolerance, in sigmas of the circle's normal
 GAP_RAD = 0.2  # largest gap between the ends of an arc and of the line
 
 
 @compiled
-def gather(
-    normal: Array64, ends: Array64, sigma: Array64, extent: Array64, moments: Array64, near: float, least_sigma: float
-) -> Array64:
-    """Merge arcs into lines: each arc, in order, takes the later ones that lie on its great circle."""
-    count = len(normal)
+def gather(arcs: Array64, near: float, least_sigma: float) -> Array64:
+    """Merge arcs (n, COLUMNS) into lines: each arc, in order, takes the later ones that lie on its great circle."""
+    count = len(arcs)
+    ends = arcs[:, FIRST : FIRST + 6].copy()
     left = np.arange(count)  # indices not yet taken, in order
     waiting = count
     rows = np.empty((count, COLUMNS))
     made = 0
     while waiting > 0:
         i = left[0]
-        n = (normal[i, 0], normal[i, 1], normal[i, 2])
+        n = (arcs[i, NORMAL], arcs[i, NORMAL + 1], arcs[i, NORMAL + 2])
         x = _ray(ends, i, 0)
         y = cross(n, x)  # angles along the circle are counted from its first end
-        low, high = 0.0, float(extent[i])
-        xx, xy, xz, yy, yz, zz, rays = _moments(moments, i)
-        slack = min(TOGETHER_SIGMAS * sigma[i], 2.0 * near)
+        low, high = 0.0, float(arcs[i, EXTENT])
+        xx, xy, xz, yy, yz, zz, rays = _moments(arcs, i)
+        slack = min(TOGETHER_SIGMAS * arcs[i, SIGMA], 2.0 * near)
         kept = 0
         for k in range(1, waiting):
             j = left[k]
@@ -51,7 +63,7 @@ def gather(
             if first > high + GAP_RAD or last < low - GAP_RAD or wide > WIDEST_RAD:
                 continue
             low, high = min(low, first), max(high, last)
-            more = _moments(moments, j)
+            more = _moments(arcs, j)
             xx, xy, xz = xx + more[0], xy + more[1], xz + more[2]
             yy, yz, zz, rays = yy + more[3], yz + more[4], zz + more[5], rays + more[6]
             kept -= 1
@@ -64,12 +76,13 @@ def gather(
 
 @compiled
 def _ray(ends: Array64, i: int, which: int) -> Vector:
-    return ends[i, which, 0], ends[i, which, 1], ends[i, which, 2]
+    return ends[i, 3 * which], ends[i, 3 * which + 1], ends[i, 3 * which + 2]
 
 
 @compiled
-def _moments(m: Array64, i: int) -> Moments:
-    return m[i, 0], m[i, 1], m[i, 2], m[i, 3], m[i, 4], m[i, 5], m[i, 6]
+def _moments(arcs: Array64, i: int) -> Moments:
+    m = arcs[i, MOMENTS:]
+    return m[0], m[1], m[2], m[3], m[4], m[5], m[6]
 
 
 @compiled

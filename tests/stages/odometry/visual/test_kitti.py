@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from stages.geometry.frames import Pose
-from stages.kernels.geometry.so3 import log_rotation
+from stages.kernels.geometry.so3 import exp_rotation, log_rotation
 from stages.messages import Image, VisualMotion
 from stages.odometry.drone import FisheyeOdometry
 from tests.stages.seen import degrees_between, of, pinhole
@@ -77,3 +77,26 @@ def test_the_stated_covariance_of_a_real_drive_is_consistent(key_parallax_deg):
     print(f"NEES: rotation {turn_nees:.1f} ({raw:.1f}) of 3, direction {direction_nees:.1f} of 2")  # noqa: T201
     assert 1.5 < turn_nees < 5.0
     assert 0.3 < direction_nees < 4.0
+
+
+def nees_over(errors, poses, images):
+    """NEES of the rotation over a number of images, the product of the motions from one to the next."""
+    rows = [row for row in errors if row[0] > FIRST_MEASURED]
+    out = []
+    for first in range(len(rows) - images + 1):
+        R, cov = np.eye(3), np.zeros((3, 3))
+        for i, error, covariance, *_ in rows[first : first + images]:
+            step = poses[i - 1, :, :3].T @ poses[i, :, :3] @ exp_rotation(-error)
+            R, cov = R @ step, step.T @ cov @ step + covariance
+        start, end = poses[rows[first][0] - 1, :, :3], poses[rows[first + images - 1][0], :, :3]
+        error = log_rotation(np.ascontiguousarray(R.T @ start.T @ end))
+        out.append(error @ np.linalg.solve(cov, error))
+    return float(np.mean(out))
+
+
+def test_the_jitter_of_the_poses_does_not_grow_with_the_number_of_images_while_the_stated_covariance_does():
+    errors, poses = odometry_errors(0.01), np.loadtxt(DRIVE / "poses.txt").reshape(-1, 3, 4)
+    nees = {images: nees_over(errors, poses, images) for images in (1, 2, 4, 6, 8, 12, 16)}
+    print("NEES of 3 by number of images:", {k: round(v, 2) for k, v in nees.items()})  # noqa: T201
+    assert all(2.0 < nees[images] < 5.0 for images in (4, 6, 8, 12))
+    assert nees[6] < 0.8 * nees[1]

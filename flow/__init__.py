@@ -14,7 +14,8 @@ from pathlib import Path
 
 CPU_INFO = Path("/proc/cpuinfo")
 OPENBLAS, NUMPY = "OPENBLAS_CORETYPE", "NPY_DISABLE_CPU_FEATURES"  # read when numpy or scipy is loaded
-NUMPY_KERNELS = {"avx512f": "X86_V4", "avx512_vbmi2": "AVX512_ICL", "avx512_fp16": "AVX512_SPR"}  # flag: kernels
+# flag of the processor: numpy's name (2.4) of the kernels that need it
+NUMPY_KERNELS = {"avx512f": "X86_V4", "avx512_vbmi2": "AVX512_ICL", "avx512_fp16": "AVX512_SPR"}
 
 
 def use_portable_kernels(environment: MutableMapping[str, str] = os.environ, cpu_info: Path = CPU_INFO) -> None:

@@ -21,6 +21,7 @@ from flow.graph import Graph, load_graph
 from links.cli.console import EXIT_FAILED, EXIT_USAGE, err, out, report_errors, warn
 from links.cli.options import Config, Overlay, Sets
 from links.preflight.shipped_values import shipped_values
+from links.runs.request import RunRequest
 from links.zenoh import host_graph
 
 OutFile = Annotated[Path | None, typer.Option("--out", "-o", help="File to write [default: the terminal].")]
@@ -44,7 +45,7 @@ def check(config: Config, overlay: Overlay = None, sets: Sets = None, hosts: Hos
     Example: grd check configs/paper.yaml --set track.radius_m=0.8
     """
     try:
-        graph = load_graph(config, overlay or (), sets or ())
+        graph = RunRequest(config, tuple(overlay or ()), tuple(sets or ())).graph(None, "")
         placed = load_hosts(hosts, graph) if hosts is not None else None
     except ConfigError as error:
         for entry in error.errors:

@@ -8,8 +8,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from flow.config_error import ConfigError, ErrorDetail, Location
 from flow.graph import Graph, load_graph
 from flow.replay import RunReport
+from links.mavlink import Autopilot
 from links.runs.fused_poses import FULL, FusedPoses
 from links.runs.results import Results
 from links.runs.truth import FixErrors
@@ -27,10 +29,13 @@ class RunRequest:
     def graph(self, rig_yaml: str | None, where: str) -> Graph:
         """The graph on the rig `rig_yaml`, read from `where`, or (None) on the rig of the configuration.
 
-        Raises ConfigError for both.
+        Raises ConfigError for both, and for a pose that would be sent to another drone's autopilot.
         """
         sections = None if rig_yaml is None else {"rig": (rig_yaml, where)}
-        return load_graph(self.config, self.overlays, self.sets, sections)
+        graph = load_graph(self.config, self.overlays, self.sets, sections)
+        if errors := _poses_of_other_drones(graph, str(self.config)):
+            raise ConfigError(errors)
+        return graph
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,3 +59,17 @@ class RunResult:
     def counted_full(self) -> bool:
         """Whether a stage published a pose with a rotation, also when a full disk has cut the pose files off."""
         return any(self.results.pose_states.get(state) for state in FULL)
+
+
+def _poses_of_other_drones(graph: Graph, file: str) -> list[ErrorDetail]:
+    """An error for each autopilot whose pose depends on another autopilot that gets poses."""
+    sent = {edge.consumer: edge for edge in graph.edges if issubclass(graph.nodes[edge.consumer].cls, Autopilot)}
+    errors: list[ErrorDetail] = []
+    for autopilot, pose in sent.items():
+        for other in sorted(graph.feeding(pose.producer) & sent.keys() - {autopilot}):
+            inputs = [e for e in graph.edges if e.consumer == pose.producer]
+            ports = ", ".join(e.port for e in inputs if other in graph.feeding(e.producer))
+            text = f"'{pose.producer}' depends on '{other}', the autopilot of another drone, by its inputs {ports}: "
+            text += "copy the stages that give them as well (`nodes` of the include), or set these inputs to null."
+            errors.append(ErrorDetail(Location(file, 0), f"links.{autopilot}.inputs.{pose.port}", text))
+    return errors

@@ -100,9 +100,8 @@ class BeamAimSettings(Settings):
     max_missed: int = Field(8, ge=1, le=MAX_MISSED)  # consecutive misses of a candidate of probability 1; else fewer
     sweep_observations: int = Field(3, ge=0)  # of a candidate, without an interruption of the sweep
     observations_per_track: int = Field(3, ge=1)  # consecutive ones of each track, if there are several
-    max_drones: int = Field(
-        1, ge=1, le=MAX_DRONES
-    )  # expected, at least one a chain; with fewer tracks the search goes on
+    # expected drones, at least one a chain; with fewer tracks the search continues between observations of tracks
+    max_drones: int = Field(1, ge=1, le=MAX_DRONES)
     search_s: float = Field(0.35, gt=0)  # duration of a search segment between observations of tracks
     beams: bool = True  # point a beam at the drone; False (ablation): the middle of the fan
     coast_sigma_m: float = Field(3.0, gt=0)  # a track with a larger position sigma is searched with the full sweep

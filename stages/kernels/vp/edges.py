@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.kernels.compiled import compiled
-from stages.kernels.prefetch import prefetch
 
 Grey = NDArray[np.uint8]
 Row = NDArray[np.int16]
@@ -25,7 +24,6 @@ QUIET_SIGMAS = 0.385  # the same quantile of the absolute value of a standard no
 NOISE_SIGMAS = 5.0
 SLOPE = 74.0  # required for one grey level of contrast; a sharp step of one level has 48
 STRIDE = 2  # every second pixel of a chain is returned: the one between adds no information
-ROWS_AHEAD = 6  # of a chain that are fetched into the cache: each is on another page of memory
 LOW_SHARE = 0.5  # a chain continues down to this share of its start threshold
 
 
@@ -216,8 +214,6 @@ def _follow(
         # the edge runs across the gradient: one step along its main axis, to the steepest of three pixels
         step = (way if gx > 0 else -way) if steep_x else (-way if gy > 0 else way)
         ahead_at = at + (step * width if steep_x else step)
-        if steep_x:
-            prefetch(slopes, np.uint64(at + ROWS_AHEAD * step * width))
         best, best_side, next_x, next_y = np.int64(low), 2, gx, gy
         for side in range(-1, 2):
             to = np.uint64(ahead_at + side * across)  # as this is never negative, no index is wound around

@@ -63,6 +63,11 @@ class RigLidar(StrictModel):
         return lidar_profile(self.model)
 
     @property
+    def elevation_rad(self) -> tuple[float, ...]:
+        """Elevation of each laser."""
+        return tuple(math.radians(w) for w in (self.beams or self.profile).elevation_deg)
+
+    @property
     def azimuth_offset_rad(self) -> tuple[float, ...]:
         """Azimuth offset of each laser."""
         profile = self.profile

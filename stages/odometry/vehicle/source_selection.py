@@ -36,6 +36,7 @@ from flow.counters import Counters
 from flow.stage import Settings, Stage
 from stages.geometry.extrapolation import AcceptedPoses, constant_turn_rate, is_reachable, speed_mps
 from stages.geometry.frames import Array64, transform
+from stages.geometry.rig_lidar import RigLidar
 from stages.geometry.se3 import adjoint
 from stages.geometry.trajectory import VehicleTrajectory
 from stages.kernels.geometry.so3 import nearest_rotation
@@ -60,6 +61,7 @@ class VehicleMotionSelectorSettings(Settings):
     """Settings of `VehicleMotionSelector`."""
 
     silent_s: float = Field(SILENT_S, gt=0, le=10)  # at least two periods of the odometry
+    unit: RigLidar = RigLidar()  # beams of the LiDAR that sends `pulses`
 
 
 class VehicleMotionSelector(Stage[VehicleMotionSelectorSettings]):
@@ -79,7 +81,7 @@ class VehicleMotionSelector(Stage[VehicleMotionSelectorSettings]):
         self._was_frozen = False  # the reason for which the odometry was denied last
         self._reported = VehicleTrajectory()  # by the odometry, also while it is denied
         self._waiting: deque[SweptPulses] = deque(maxlen=WAITING)  # slices that are newer than the odometry
-        self._scan, self._consistency = StaticScan(), LidarConsistency()
+        self._scan, self._consistency = StaticScan(self.settings.unit), LidarConsistency()
 
     @property
     def rejected(self) -> Counter[str]:

@@ -9,8 +9,8 @@ with the surface's normal n and the time dt between both measurements. w is esti
 direction of travel (|n . x| > FACING), by Huber's weights, in SECTORS sectors of the revolution. Most of the sectors
 with an estimate, and at least two, must agree: a vehicle that passes is only in some of them.
 
-Nothing is known on a road between walls parallel to it, in an open field, and among trees; nor with another LiDAR than
-one of 16 beams 2 deg apart (VLP-16, XT16).
+LASERS of the lasers are used, evenly spaced over the fan: the effort is about the same with every model. Nothing is
+known on a road between walls parallel to it, in an open field, and among trees.
 
 Source: ours; Huber weights: P. J. Huber, "Robust Estimation of a Location Parameter", 1964.
 """
@@ -20,16 +20,18 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stages.geometry.frames import Array64
-from stages.kernels.odometry.scan_residuals import LASERS, LOWEST_DEG, SPACING_DEG, scan_residuals
+from stages.geometry.rig_lidar import RigLidar
+from stages.kernels.odometry.scan_residuals import Revolution, scan_residuals
 from stages.messages import SweptPulses
 
-EVERY = 4  # of the firings
+LASERS = 16  # at most
+EVERY = 4  # of the columns
 LEAST_RANGE_M = 3.5  # nearer returns are from the vehicle itself
 FACING = 0.4
 SECTORS, LEAST_SECTORS = 16, 2
@@ -40,12 +42,7 @@ INLIER_M, INLIERS = 0.06, 0.7  # share of the rows that must fit
 ROW_SIGMA_M = 0.02  # smallest sigma of a distance
 SURFACE_MPS = 0.1  # error of the estimate by surfaces that are no planes, one sigma
 AGREE_SIGMAS, AGREE_MPS, AGREE_SHARE = 3.0, 0.2, 0.7  # difference of a sector from the median; share that agrees
-FAN_RAD = math.radians(-2.0 * LOWEST_DEG)  # between the outermost beams
-SAME_FAN_RAD = math.radians(0.5 * SPACING_DEG)
 KEPT_NS = 500_000_000  # of slices and revolutions that wait for a pose
-
-
-Integers = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,19 +55,25 @@ class VelocityError:
     speed_mps: float  # reported
 
 
-@dataclass(frozen=True, slots=True)
-class _Revolution:
-    stamp_ns: Integers  # (f,)
-    xyz_m: Array64  # (f, 16, 3) in frame map, by the reported motion
-    range_m: Array64  # (f, 16)
-    origin_m: Array64  # (f, 3)
-    axis: Array64  # (f, 3) spin axis, towards the highest laser
-    middle: Array64  # (f, 3) middle of the fan
-    step_rad: float  # turn of the rotor per firing
-    forward: Array64  # (3,) axis x of the vehicle
+class Fan:
+    """The k lasers that are used, of the `lasers` of a unit, by elevation."""
+
+    def __init__(self, unit: RigLidar) -> None:
+        elevation_rad = np.array(unit.elevation_rad)
+        order = np.argsort(elevation_rad)
+        evenly_rad = np.linspace(elevation_rad[order[0]], elevation_rad[order[-1]], LASERS)
+        nearest = np.abs(elevation_rad[order] - evenly_rad[:, None]).argmin(axis=1)
+        self.used = order[np.unique(nearest)]
+        self.lasers = unit.profile.lasers
+        elevation_rad = elevation_rad[self.used]
+        self.between_rad = 0.5 * (elevation_rad[1:] + elevation_rad[:-1])
+        azimuth_rad = np.array(unit.azimuth_offset_rad)[self.used]
+        self.azimuth_rad = azimuth_rad - azimuth_rad.mean()
+        # (2, k): by beams of one azimuth, cos w radial + sin w axis, the direction of elevation 0 and the spin axis
+        self.weights = np.linalg.pinv(np.column_stack((np.cos(elevation_rad), np.sin(elevation_rad))))
 
 
-class _Posed(NamedTuple):
+class PosedSlice(NamedTuple):
     """A slice and the reported T_map_vehicle, R (3, 3) and t (3,), at its first and last pulse."""
 
     pulses: SweptPulses
@@ -81,10 +84,11 @@ class _Posed(NamedTuple):
 class StaticScan:
     """Compares each revolution with the one before."""
 
-    def __init__(self) -> None:
-        self._slices: deque[_Posed] = deque()
+    def __init__(self, unit: RigLidar) -> None:
+        self._fan = Fan(unit)
+        self._slices: deque[PosedSlice] = deque()
         self._turned_rad = 0.0  # of the rotor, by the slices
-        self._before: _Revolution | None = None
+        self._before: Revolution | None = None
 
     def restart(self) -> None:
         """Forget everything: the motion has a new start frame."""
@@ -98,97 +102,76 @@ class StaticScan:
 
         Returns the velocity error at a revolution's end, if observable.
         """
-        firings = len(pulses.range_m) // LASERS
-        if firings < 2 or firings * LASERS != len(pulses.range_m) or not math.isfinite(pulses.turntable_rad):
+        fan = self._fan
+        firings = len(pulses.range_m) // fan.lasers
+        if firings < 2:
             return None
         if self._slices and pulses.stamp_ns - self._slices[-1].pulses.stamp_ns > KEPT_NS:
             self.restart()
-        directions = pulses.direction_vehicle.reshape(firings, LASERS, 3)
-        if int(pulses.laser.max()) != LASERS - 1 or abs(_fan_rad(directions[0]) - FAN_RAD) > SAME_FAN_RAD:
-            return None
-        begin, end = (directions[at].astype(np.float64).mean(axis=0) for at in (0, -1))
+        directions = pulses.direction_vehicle.reshape(firings, fan.lasers, 3)
+        begin, end = (fan.weights[0] @ directions[at, fan.used] for at in (0, -1))
         cosine = float(begin @ end / (np.linalg.norm(begin) * np.linalg.norm(end)))
         self._turned_rad += math.acos(min(max(cosine, -1.0), 1.0)) * firings / (firings - 1)
-        self._slices.append(_Posed(pulses, first, last))
+        self._slices.append(PosedSlice(pulses, first, last))
         if self._turned_rad < 2 * math.pi:
             return None
-        revolution = _revolution(list(self._slices))
+        revolution = revolution_of(fan, list(self._slices), self._turned_rad)
         self._slices.clear()
         self._turned_rad = 0.0
         before, self._before = self._before, revolution
-        return None if before is None else velocity_error(before, revolution)
+        return None if before is None else velocity_error(before, revolution, fan.between_rad, last[0][:, 0])
 
 
-def _fan_rad(directions: NDArray[np.float32]) -> float:
-    """Largest angle between two of the beams (n, 3)."""
-    return math.acos(min(max(float((directions @ directions.T).min()), -1.0), 1.0))
-
-
-def _in_map(posed: _Posed) -> tuple[Array64, Array64]:
-    """Directions (f, 16, 3) and origins (f, 3) of a slice's firings in frame map, by poses interpolated linearly."""
-    stamp_ns = posed.pulses.point_stamp_ns[::LASERS]
+def _in_map(fan: Fan, posed: PosedSlice) -> tuple[Array64, Array64]:
+    """Directions (f, k, 3) and origins (f, 3) of a slice's firings in frame map, by poses interpolated linearly."""
+    stamp_ns = posed.pulses.point_stamp_ns[:: fan.lasers]
     share = ((stamp_ns - stamp_ns[0]) / max(int(posed.pulses.point_stamp_ns[-1] - stamp_ns[0]), 1))[:, None]
     (R_0, t_0), (R_1, t_1) = posed.first, posed.last
     R = R_0 + share[..., None] * (R_1 - R_0)
-    directions = posed.pulses.direction_vehicle.reshape(-1, LASERS, 3).astype(np.float64) @ R.transpose(0, 2, 1)
-    return directions, R @ np.array(posed.pulses.origin_vehicle_m) + t_0 + share * (t_1 - t_0)
+    directions = posed.pulses.direction_vehicle.reshape(-1, fan.lasers, 3)[:, fan.used].astype(np.float64)
+    return directions @ R.transpose(0, 2, 1), R @ np.array(posed.pulses.origin_vehicle_m) + t_0 + share * (t_1 - t_0)
 
 
-def _revolution(slices: list[_Posed]) -> _Revolution:
-    turned, origins = zip(*map(_in_map, slices), strict=True)
+def revolution_of(fan: Fan, slices: list[PosedSlice], turned_rad: float) -> Revolution:
+    """The slices' firings as columns of one azimuth: column c has the pulse of firing c - shift of each laser."""
+    turned, origins = zip(*(_in_map(fan, posed) for posed in slices), strict=True)
     directions, origin_m = np.concatenate(turned), np.concatenate(origins)
-    range_m = np.concatenate([posed.pulses.range_m for posed in slices]).reshape(-1, LASERS).astype(np.float64)
-    stamp_ns = np.concatenate([posed.pulses.point_stamp_ns[::LASERS] for posed in slices])
-    order, axis = _by_elevation(directions)
-    directions, range_m = np.ascontiguousarray(directions[:, order]), np.ascontiguousarray(range_m[:, order])
-    middle = directions[:, LASERS // 2 - 1] + directions[:, LASERS // 2]
-    middle /= np.linalg.norm(middle, axis=1, keepdims=True)
-    sines = np.einsum("ij,ij->i", np.cross(middle[:-1], middle[1:]), axis[:-1])
-    return _Revolution(
-        stamp_ns=stamp_ns,
-        xyz_m=origin_m[:, None] + directions * range_m[..., None],
-        range_m=range_m,
-        origin_m=origin_m,
-        axis=axis,
-        middle=middle,
-        step_rad=float(np.median(np.arcsin(sines))),
-        forward=slices[-1].last[0][:, 0],
+    range_m, stamp_ns = (
+        np.concatenate([getattr(posed.pulses, name).reshape(-1, fan.lasers)[:, fan.used] for posed in slices])
+        for name in ("range_m", "point_stamp_ns")
+    )
+    range_m = range_m.astype(np.float64)
+    step_rad = turned_rad / len(range_m)
+    shift = np.rint(fan.azimuth_rad / step_rad).astype(np.int64)
+    first, end = shift.max(), len(range_m) + shift.min()
+
+    def columns(of_firings: NDArray[Any]) -> NDArray[Any]:
+        return np.stack([of_firings[first - n : end - n, k] for k, n in enumerate(shift)], axis=1)
+
+    frame = fan.weights @ columns(directions)
+    frame /= np.linalg.norm(frame, axis=2, keepdims=True)
+    return Revolution(
+        stamp_ns=columns(stamp_ns),
+        xyz_m=columns(origin_m[:, None] + directions * range_m[..., None]),
+        range_m=columns(range_m),
+        origin_m=origin_m[first:end],
+        radial=np.ascontiguousarray(frame[:, 0]),
+        axis=np.ascontiguousarray(frame[:, 1]),
+        step_rad=step_rad,
     )
 
 
-def _by_elevation(directions: Array64) -> tuple[Integers, Array64]:
-    """Order of the lasers by elevation, and the spin axis (f, 3) per firing, which is nearest to the highest one."""
-    ends = directions - directions.mean(axis=1, keepdims=True)
-    spread = ends[0]
-    first = np.linalg.svd(spread)[2][0]  # the lasers of a firing lie in the plane of fan and axis
-    order = np.argsort(spread @ first).astype(np.int64)
-    axis = directions[:, order[-1]] - directions[:, order[0]]
-    return order, axis / np.linalg.norm(axis, axis=1, keepdims=True)
+def velocity_error(before: Revolution, now: Revolution, between_rad: Array64, forward: Array64) -> VelocityError | None:
+    """Velocity error between two revolutions; None: not observable, or the sectors disagree.
 
-
-def velocity_error(before: _Revolution, now: _Revolution) -> VelocityError | None:
-    """Velocity error between two revolutions; None: not observable, or the sectors disagree."""
-    if before.step_rad == 0.0:
-        return None
-    rows = scan_residuals(
-        before.xyz_m,
-        before.range_m,
-        before.origin_m,
-        before.axis,
-        before.middle,
-        before.step_rad,
-        now.xyz_m,
-        now.range_m,
-        EVERY,
-        LEAST_RANGE_M,
-    )
-    facing = rows[:, 1:4] @ now.forward
+    `between_rad`: as in `scan_residuals`; `forward`: axis x of the vehicle, frame map.
+    """
+    rows = scan_residuals(before, now, between_rad, EVERY, LEAST_RANGE_M)
+    facing = rows[:, 1:4] @ forward
     used = np.abs(facing) > FACING
     rows, facing = rows[used], facing[used]
-    new = rows[:, 4].astype(np.int64)
-    seconds = (now.stamp_ns[new] - before.stamp_ns[rows[:, 5].astype(np.int64)]) * 1e-9
-    sector = new * SECTORS // len(now.stamp_ns)
-    slope_s = -facing * seconds
+    slope_s = -facing * rows[:, 4]
+    sector = rows[:, 5].astype(np.int64) * SECTORS // len(now.range_m)
     estimates = [_huber(rows[sector == k, 0], slope_s[sector == k]) for k in range(SECTORS)]
     velocity, sigma = np.array([estimate for estimate in estimates if estimate is not None]).reshape(-1, 2).T
     if len(velocity) < LEAST_SECTORS:
@@ -200,10 +183,10 @@ def velocity_error(before: _Revolution, now: _Revolution) -> VelocityError | Non
     error_mps = -float(weights @ velocity[agree] / weights.sum())
     travelled_m = float(np.linalg.norm(now.origin_m[-1] - before.origin_m[-1]))
     return VelocityError(
-        stamp_ns=int(now.stamp_ns[-1]),
+        stamp_ns=int(now.stamp_ns[-1, -1]),
         error_mps=error_mps,
         sigma_mps=math.hypot(float(weights.sum() ** -0.5), SURFACE_MPS),
-        speed_mps=travelled_m / max((now.stamp_ns[-1] - before.stamp_ns[-1]) * 1e-9, 1e-3),
+        speed_mps=travelled_m / max((now.stamp_ns[-1, -1] - before.stamp_ns[-1, -1]) * 1e-9, 1e-3),
     )
 
 

@@ -16,7 +16,7 @@ from stages.geometry.frames import rotation_z, transform
 from stages.geometry.trajectory import VehicleTrajectory
 from stages.messages import MotionStatus, VehicleMotion
 from stages.odometry.vehicle import VehicleMotionSelector
-from tests.stages.odometry.vehicle.test_static_scan import WALLS, slices
+from tests.stages.odometry.vehicle.test_static_scan import WALLS, SimulatedLidar, slices
 
 S = 1_000_000_000
 
@@ -266,10 +266,12 @@ def test_a_frozen_ego_motion_or_parked_vehicle_is_not_denied():
     assert all(m.status is MotionStatus.ACCEPTED for m in published(VehicleMotionSelector(), odometry=still))
 
 
+@pytest.mark.parametrize("model", ["VLP-16", "OS1-32"])
 @pytest.mark.parametrize(("reported", "denied"), [(1.0, 0), (0.0, 1), (1.2, 1)])
-def test_an_odometry_that_contradicts_the_lidar_is_denied(reported, denied):
-    selector, out = VehicleMotionSelector(), []
-    for pulses, (_, at_m) in slices(5.0, 2.0, WALLS):
+def test_an_odometry_that_contradicts_the_lidar_is_denied(reported, denied, model):
+    unit = SimulatedLidar.model_validate({"model": model})
+    selector, out = VehicleMotionSelector(unit=unit), []
+    for pulses, (_, at_m) in slices(5.0, 2.0, WALLS, unit=unit):
         last_ns = int(pulses.point_stamp_ns[-1])
         motion = VehicleMotion(stamp_ns=last_ns, xyz_map_m=reported * at_m, R_map_vehicle=np.eye(3), covariance=None)
         out += [selector.on_odometry(motion), selector.on_pulses(pulses)]

@@ -9,8 +9,8 @@ with the surface's normal n and the time dt between both measurements. w is esti
 direction of travel (|n . x| > FACING), by Huber's weights, in SECTORS sectors of the revolution. Most of the sectors
 with an estimate, and at least two, must agree: a vehicle that passes is only in some of them.
 
-LASERS of the lasers are used, evenly spaced over the fan: the effort is about the same with every model. Nothing is
-known on a road between walls parallel to it, in an open field, and among trees.
+Up to LASERS of the lasers are used, evenly spaced about the middle of the fan: the effort is about the same with every
+model. Nothing is known on a road between walls parallel to it, in an open field, and among trees.
 
 Source: ours; Huber weights: P. J. Huber, "Robust Estimation of a Location Parameter", 1964.
 """
@@ -30,7 +30,7 @@ from stages.geometry.rig_lidar import RigLidar
 from stages.kernels.odometry.scan_residuals import Revolution, scan_residuals
 from stages.messages import SweptPulses
 
-LASERS = 16  # at most
+LASERS, WIDTH_RAD = 16, math.radians(30.0)  # at most: 2 deg apart, so that the neighbours of a cell are on one surface
 EVERY = 4  # of the columns
 LEAST_RANGE_M = 3.5  # nearer returns are from the vehicle itself
 FACING = 0.4
@@ -60,15 +60,16 @@ class Fan:
 
     def __init__(self, unit: RigLidar) -> None:
         elevation_rad = np.array(unit.elevation_rad)
-        order = np.argsort(elevation_rad)
-        evenly_rad = np.linspace(elevation_rad[order[0]], elevation_rad[order[-1]], LASERS)
+        self.lasers, order = len(elevation_rad), np.argsort(elevation_rad)
+        low, high = min(unit.elevation_rad), max(unit.elevation_rad)
+        middle, half = 0.5 * (high + low), 0.5 * min(high - low, WIDTH_RAD)
+        evenly_rad = np.linspace(middle - half, middle + half, LASERS)
         nearest = np.abs(elevation_rad[order] - evenly_rad[:, None]).argmin(axis=1)
         self.used = order[np.unique(nearest)]
-        self.lasers = unit.profile.lasers
         elevation_rad = elevation_rad[self.used]
         self.between_rad = 0.5 * (elevation_rad[1:] + elevation_rad[:-1])
         azimuth_rad = np.array(unit.azimuth_offset_rad)[self.used]
-        self.azimuth_rad = azimuth_rad - azimuth_rad.mean()
+        self.azimuth_rad = azimuth_rad - 0.5 * (azimuth_rad.max() + azimuth_rad.min())
         # (2, k): by beams of one azimuth, cos w radial + sin w axis, the direction of elevation 0 and the spin axis
         self.weights = np.linalg.pinv(np.column_stack((np.cos(elevation_rad), np.sin(elevation_rad))))
 

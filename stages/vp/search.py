@@ -121,7 +121,8 @@ def _frames(lines: Lines, axes: Array64, limits: SearchLimits) -> tuple[list[flo
 
     Also returns whether each is confident, and the score of the first. A further pair must be significant without the
     lines of any 90 deg of azimuth, in which a board, a car or a shelf lies; and each of its directions by itself: an
-    object such as a shadow edge has one direction only. One that is less so is weak: not confident, but kept.
+    object such as a shadow edge has one direction only. One that is less so is weak: not confident, but kept. The first
+    pair is weak as well if another one is confident: alone it may be one facade, beside another it may be a board.
     """
     free = ~_along_vertical(lines, axes[:, 2], limits)
     yaws: list[float] = []
@@ -143,8 +144,8 @@ def _frames(lines: Lines, axes: Array64, limits: SearchLimits) -> tuple[list[flo
         near = _near(lines, axes, yaw, limits) & free
         if near.sum() < limits.min_lines * (1.5 if yaws else 1.0):
             break
-        direction, elsewhere = pair_support(lines, axes, free, limits.sigma_model, yaw) if yaws else (np.inf, np.inf)
-        if direction >= limits.min_direction_score and elsewhere >= limits.min_elsewhere_score:
+        direction, elsewhere = pair_support(lines, axes, free, limits.sigma_model, yaw)
+        if not yaws or (direction >= limits.min_direction_score and elsewhere >= limits.min_elsewhere_score):
             yaws.append(yaw)
             confident.append(
                 direction >= limits.confident_direction_score and elsewhere >= limits.confident_elsewhere_score
@@ -152,6 +153,8 @@ def _frames(lines: Lines, axes: Array64, limits: SearchLimits) -> tuple[list[flo
         else:
             rejected.append(yaw)
         free = free & ~near
+    if yaws and not any(confident):
+        confident[0] = True
     return yaws, confident, first_score
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +17,7 @@ import cv2
 import numpy as np
 
 from stages.geometry.frames import Pose, quaternions_xyzw, rotation_from_rpy_deg, rotation_z
-from stages.geometry.lens import Equidistant
+from stages.geometry.lens import Equidistant, KannalaBrandt
 from stages.messages import CameraMount, DroneTilt, Image, VanishingDirections
 from stages.vp import GreatCircleVp
 
@@ -37,10 +38,33 @@ TILT_DEG = {CameraMount.VEHICLE: 1.5, CameraMount.DRONE: 8.0}  # of a render aga
 NADIR_DEG = 25.0  # the panoramas have no image below the tripod
 
 
-def fisheye(size_px: int = 720) -> Equidistant:
-    """A fisheye of 235 deg."""
-    middle = (size_px - 1) / 2
-    return Equidistant(focal_px=(size_px / 2 - 2) / math.radians(117.5), centre_px=(middle, middle))
+def fisheye(size_px: int = 720, fov_deg: float = 235.0) -> Equidistant:
+    """An equidistant fisheye."""
+    middle, edge_rad = (size_px - 1) / 2, math.radians(fov_deg / 2)
+    return Equidistant(focal_px=(size_px / 2 - 2) / edge_rad, centre_px=(middle, middle), max_off_axis_deg=fov_deg / 2)
+
+
+def equisolid(size_px: int, fov_deg: float) -> KannalaBrandt:
+    """An equisolid fisheye, r = 2 f sin(theta / 2), by its series to theta^9."""
+    middle, edge_rad = (size_px - 1) / 2, math.radians(fov_deg / 2)
+    focal_px = (size_px / 2 - 2) / (2.0 * math.sin(edge_rad / 2))
+    return KannalaBrandt(
+        focal_px=(focal_px, focal_px),
+        centre_px=(middle, middle),
+        k=(-1 / 24, 1 / 1920, -1 / 322560, 1 / 92897280),
+        max_off_axis_deg=fov_deg / 2,
+    )
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """Lens and disturbances of renders."""
+
+    lens: Equidistant | KannalaBrandt = fisheye()  # noqa: RUF009, it is immutable
+    sensor: Callable[[np.ndarray, np.random.Generator], np.ndarray] | None = None  # None: exposure etc. at random
+    people: int | None = None  # None: up to three
+    boards: int | None = None  # None: one in half of the renders
+    tilt_deg: float | None = None  # one sigma, each axis; None: TILT_DEG
 
 
 @dataclass(frozen=True)
@@ -76,17 +100,18 @@ def _panorama(name: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 @functools.cache
-def _rays(size_px: int) -> np.ndarray:
+def _rays(lens: Equidistant | KannalaBrandt) -> np.ndarray:
     """(2 size_px, 2 size_px, 3) float32: two rays per pixel along each axis; NaN outside the lens."""
+    size_px = round(2 * lens.centre_px[0]) + 1
     axis = (np.arange(2 * size_px) + 0.5) / 2 - 0.5
     column, row = np.meshgrid(axis, axis)
-    rays = fisheye(size_px).unproject(np.column_stack([column.ravel(), row.ravel()]))
+    rays = lens.unproject(np.column_stack([column.ravel(), row.ravel()]))
     return rays.reshape(2 * size_px, 2 * size_px, 3).astype(np.float32)
 
 
-def random_rotation(rng: np.random.Generator, camera_mount: CameraMount) -> np.ndarray:
-    """R_world_mount: any yaw, tilted as a vehicle or a drone is."""
-    tilt = rng.normal(0.0, TILT_DEG[camera_mount], 2)
+def random_rotation(rng: np.random.Generator, camera_mount: CameraMount, tilt_deg: float | None = None) -> np.ndarray:
+    """R_world_mount: any yaw, tilted as a vehicle or a drone is, or by `tilt_deg` (one sigma, each axis)."""
+    tilt = rng.normal(0.0, TILT_DEG[camera_mount] if tilt_deg is None else tilt_deg, 2)
     return rotation_z(rng.uniform(0.0, 2 * math.pi)) @ rotation_from_rpy_deg((tilt[0], tilt[1], 0.0))
 
 
@@ -95,12 +120,15 @@ def render(
     camera_mount: CameraMount,
     R_world_mount: np.ndarray,
     rng: np.random.Generator | None = None,
-    size_px: int = 720,
+    conditions: Conditions | None = None,
 ) -> Render:
     """The image of a camera; disturbed if `rng` is given."""
+    given = conditions or Conditions()
     grey, R_panorama_world = _panorama(name)
     R_world_camera = R_world_mount @ R_MOUNT_CAMERA[camera_mount]
-    world = _rays(size_px) @ R_world_camera.T.astype(np.float32)
+    eye = _rays(given.lens)
+    size_px = len(eye) // 2
+    world = eye @ R_world_camera.T.astype(np.float32)
     rays = world @ R_panorama_world.T.astype(np.float32)
     inside = np.isfinite(rays[..., 2])
     rays = np.nan_to_num(rays, nan=0.5)
@@ -109,14 +137,14 @@ def render(
     v = (0.5 - np.arcsin(np.clip(rays[..., 2], -1.0, 1.0)) / math.pi) * height - 0.5
     image = cv2.remap(grey, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP).astype(np.float32)
     if rng is not None:
-        for _ in range(rng.integers(0, 4)):
+        for _ in range(rng.integers(0, 4) if given.people is None else given.people):
             _person(image, world, rng)
-        if rng.random() < 0.5:
-            _board(image, np.nan_to_num(_rays(size_px)), rng)
+        for _ in range(int(rng.random() < 0.5) if given.boards is None else given.boards):
+            _board(image, np.nan_to_num(eye), rng)
     image[~inside] = 0.0
     image = cv2.resize(image, (size_px, size_px), interpolation=cv2.INTER_AREA)
     if rng is not None:
-        image = _sensor(image, rng)
+        image = (given.sensor or _sensor)(image, rng)
     return Render(np.clip(np.round(image), 0, 255).astype(np.uint8), R_world_mount)
 
 
@@ -215,23 +243,42 @@ def direction_errors(found: VanishingDirections, R_world_mount: np.ndarray, trut
     return DirectionErrors(error, np.degrees(found.sigma_rad), bool((found.frame >= 0).any()), found.reason)
 
 
-def grd_stage(camera_mount: CameraMount, **settings) -> GreatCircleVp:
-    """grd's stage for the camera of the renders."""
+def sensor(gain: float = 1.0, blur_px: float = 0.0, noise: float = 2.0, quality: int = 85):
+    """A camera with these properties: exposure, defocus [px, one sigma], noise [grey levels, one sigma], JPEG."""
+
+    def image_of(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        image = 255.0 * np.clip(image / 255.0 * gain, 0.0, 1.0)
+        if blur_px:
+            image = cv2.GaussianBlur(image, (0, 0), blur_px)
+        return jpeg(image + rng.normal(0.0, noise, image.shape), quality).astype(np.float32)
+
+    return image_of
+
+
+def grd_stage(camera_mount: CameraMount, lens: Equidistant | KannalaBrandt, **settings) -> GreatCircleVp:
+    """grd's stage for a camera of the renders."""
     quaternion = quaternions_xyzw(R_MOUNT_CAMERA[camera_mount][None])[0]
     mount = Pose(quaternion_xyzw=tuple(quaternion))
-    return GreatCircleVp(camera_mount=camera_mount, T_mount_camera=mount, lens=fisheye(), **settings)
+    return GreatCircleVp(camera_mount=camera_mount, T_mount_camera=mount, lens=lens, **settings)
 
 
 def errors_of_renders(
-    name: str, camera_mount: CameraMount, count: int, seed: int, tilt: bool = True, **settings
+    name: str,
+    camera_mount: CameraMount,
+    count: int,
+    seed: int,
+    tilt: bool = True,
+    conditions: Conditions | None = None,
+    **settings,
 ) -> list[DirectionErrors]:
     """Errors of grd on `count` disturbed renders; `tilt`: the drone has the autopilot's tilt."""
+    given = conditions or Conditions()
     rng = np.random.default_rng([int(name), camera_mount is CameraMount.DRONE, seed])
     tilts = np.random.default_rng([seed, 1])
-    vp, truth, out = grd_stage(camera_mount, **settings), true_directions(name), []
+    vp, truth, out = grd_stage(camera_mount, given.lens, **settings), true_directions(name), []
     for k in range(count):
         stamp_ns = (k + 1) * 1_000_000_000
-        image = render(name, camera_mount, random_rotation(rng, camera_mount), rng)
+        image = render(name, camera_mount, random_rotation(rng, camera_mount, given.tilt_deg), rng, given)
         if tilt and camera_mount is CameraMount.DRONE:
             vp.on_tilt(tilt_at(image.R_world_mount, tilts, stamp_ns))
         found = vp.on_image(Image(stamp_ns=stamp_ns, frame_id=f"camera_{camera_mount.value}", grey=image.grey))

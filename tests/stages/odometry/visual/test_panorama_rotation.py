@@ -11,7 +11,7 @@ from stages.geometry.frames import Pose, rotation_from_rpy_deg
 from stages.kernels.geometry.so3 import exp_rotation, log_rotation
 from stages.messages import CameraMount, DroneImu, Image, VisualMotion
 from stages.odometry.drone import FisheyeOdometry
-from tests.stages.panoramas import FOLDER, fisheye, jpeg, render
+from tests.stages.panoramas import FOLDER, Conditions, fisheye, jpeg, render
 from tests.stages.seen import of
 
 pytestmark = pytest.mark.skipif(not FOLDER.exists(), reason="needs ../shared/data/panoramas")
@@ -49,7 +49,7 @@ def rolled(name, R, rate_radps, readout_s):
     for band in np.array_split(np.arange(480), 10):
         after_s = (band.mean() - 239.5) / 479.0 * readout_s
         turned = R @ exp_rotation(rate_radps * after_s)
-        grey[band] = render(name, CameraMount.DRONE, turned, size_px=480).grey[band]
+        grey[band] = render(name, CameraMount.DRONE, turned, conditions=Conditions(lens=fisheye(480))).grey[band]
     return grey
 
 

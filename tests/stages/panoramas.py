@@ -64,7 +64,6 @@ class Conditions:
     sensor: Callable[[np.ndarray, np.random.Generator], np.ndarray] | None = None  # None: exposure etc. at random
     people: int | None = None  # None: up to three
     boards: int | None = None  # None: one in half of the renders
-    tilt_deg: float | None = None  # one sigma, each axis; None: TILT_DEG
 
 
 @dataclass(frozen=True)
@@ -109,9 +108,9 @@ def _rays(lens: Equidistant | KannalaBrandt) -> np.ndarray:
     return rays.reshape(2 * size_px, 2 * size_px, 3).astype(np.float32)
 
 
-def random_rotation(rng: np.random.Generator, camera_mount: CameraMount, tilt_deg: float | None = None) -> np.ndarray:
-    """R_world_mount: any yaw, tilted as a vehicle or a drone is, or by `tilt_deg` (one sigma, each axis)."""
-    tilt = rng.normal(0.0, TILT_DEG[camera_mount] if tilt_deg is None else tilt_deg, 2)
+def random_rotation(rng: np.random.Generator, camera_mount: CameraMount) -> np.ndarray:
+    """R_world_mount: any yaw, tilted as a vehicle or a drone is."""
+    tilt = rng.normal(0.0, TILT_DEG[camera_mount], 2)
     return rotation_z(rng.uniform(0.0, 2 * math.pi)) @ rotation_from_rpy_deg((tilt[0], tilt[1], 0.0))
 
 
@@ -278,7 +277,7 @@ def errors_of_renders(
     vp, truth, out = grd_stage(camera_mount, given.lens, **settings), true_directions(name), []
     for k in range(count):
         stamp_ns = (k + 1) * 1_000_000_000
-        image = render(name, camera_mount, random_rotation(rng, camera_mount, given.tilt_deg), rng, given)
+        image = render(name, camera_mount, random_rotation(rng, camera_mount), rng, given)
         if tilt and camera_mount is CameraMount.DRONE:
             vp.on_tilt(tilt_at(image.R_world_mount, tilts, stamp_ns))
         found = vp.on_image(Image(stamp_ns=stamp_ns, frame_id=f"camera_{camera_mount.value}", grey=image.grey))

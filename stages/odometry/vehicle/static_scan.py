@@ -105,7 +105,7 @@ class StaticScan:
         """
         fan = self._fan
         firings = len(pulses.range_m) // fan.lasers
-        if firings < 2:
+        if firings < 2 or firings * fan.lasers != len(pulses.range_m):  # empty, or of another LiDAR
             return None
         if self._slices and pulses.stamp_ns - self._slices[-1].pulses.stamp_ns > KEPT_NS:
             self.restart()

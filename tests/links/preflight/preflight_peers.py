@@ -1,10 +1,8 @@
-"""Peers of a preflight: a sending LiDAR, a drone moved by hand as requested, and a fake tracker."""
+"""Peers of a preflight: a LiDAR packet, a drone moved by hand as requested, and a fake tracker."""
 
 from __future__ import annotations
 
 import math
-import subprocess
-import sys
 
 import cv2
 import numpy as np
@@ -12,8 +10,6 @@ from pymavlink.dialects.v20 import ardupilotmega
 
 from flow.link import Record
 from flow.stage import Settings, Stage
-from links.lidar import packet_format
-from links.lidar.velodyne import TIMESTAMP_AT
 from links.mavlink.profiles import required_parameters
 from links.mavlink.transport.framing import packed, parse_frame
 from links.simulated.autopilot.autopilot import Autopilot, AutopilotSettings
@@ -24,7 +20,6 @@ from stages.geometry.rig_lidar import RigLidar
 from stages.messages import DroneFix, DroneLocalPosition
 
 SPEED = 8.0  # rad/s, phase of a hand motion: forth and back in 0.4 s
-FORM = packet_format("VLP-16")
 START_NS, SECONDS = 1_748_773_230_000_000_000, 60.0
 
 
@@ -35,39 +30,6 @@ def packet(first_pulse_ns: int, mode: str = "strongest") -> bytes:
     azimuths = np.linspace(0.0, 0.08, firings)
     encoder = PacketEncoder(RigLidar(), mode)
     return encoder.encode(first_pulse_ns, azimuths, np.full(shape, 10.0), np.full(shape, 50, np.uint8))
-
-
-SENDER = """\
-import socket, sys, time
-port, packet_ns, at = (int(word) for word in sys.argv[1:])
-packet, sent, began_ns = bytearray(sys.stdin.buffer.read()), 0, time.monotonic_ns()
-with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
-    while True:
-        time.sleep(0.002)
-        while (sent + 1) * packet_ns < time.monotonic_ns() - began_ns:
-            packet[at : at + 4] = (sent * packet_ns // 1000).to_bytes(4, "little")
-            udp.sendto(packet, ("127.0.0.1", port))
-            sent += 1
-"""
-
-
-class SendingLidar:
-    """Sends packets at the sensor's pace until its context ends, in a process: ours may be busy, a sensor is not."""
-
-    def __init__(self, port: int) -> None:
-        numbers = (port, FORM.packet_ns("strongest"), TIMESTAMP_AT)
-        self._command = [sys.executable, "-S", "-E", "-c", SENDER, *map(str, numbers)]
-
-    def __enter__(self) -> SendingLidar:
-        self._process = subprocess.Popen(self._command, stdin=subprocess.PIPE)
-        assert self._process.stdin is not None
-        self._process.stdin.write(packet(0))
-        self._process.stdin.close()
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self._process.kill()
-        self._process.wait()
 
 
 def good_parameters(profile="ardupilot") -> dict[str, float]:

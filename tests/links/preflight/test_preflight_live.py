@@ -21,20 +21,21 @@ from links.simulated.autopilot.ardupilot_rules import ArduPilotRules
 from links.simulated.autopilot.autopilot_socket import AutopilotSocket
 from links.simulated.sensors.dynamixel_emulator import DynamixelEmulator
 from links.simulated.sensors.servo import ServoSettings
+from stages.geometry.rig_lidar import RigLidar
 from tests.links.ports import free_port
 from tests.links.preflight.preflight_peers import (
     START_NS,
     HandHeld,
     OnTheGround,
-    SendingLidar,
     film,
     good_parameters,
 )
+from tests.links.preflight.sending_lidar import SendingLidar
 
 ROOT = Path(__file__).resolve().parents[3]
 LISTEN_S = 2.2
 CONFIG = """\
-include: {estimate}
+include: {included}
 links:
   lidar: {{config: {{port: {lidar}, timeout_s: 1.0}}}}
   servo: {{config: {{port: {servo}, start_timeout_s: 1.0, reply_timeout_s: 0.1, watchdog_s: 1.0}}}}
@@ -60,9 +61,9 @@ class Bench:
         self.ports = {"lidar": free_port(), "autopilot": free_port()}
         film(folder / "film.avi")
 
-    def write(self, servo: Path) -> Graph:
-        estimate = ROOT / "configs" / "estimate.yaml"
-        text = CONFIG.format(estimate=estimate, servo=servo, film=self.folder / "film.avi", **self.ports)
+    def write(self, servo: Path, rig: str = "standard") -> Graph:
+        included = f"[{ROOT}/configs/estimate.yaml, {ROOT}/configs/rigs/{rig}.yaml]"
+        text = CONFIG.format(included=included, servo=servo, film=self.folder / "film.avi", **self.ports)
         return self.read(text)
 
     def read(self, text: str) -> Graph:
@@ -107,6 +108,30 @@ def test_a_ready_rig_is_go_with_exit_code_0(bench, emulator):
     names = ("lidar rate", "lidar losses", "servo replies", "camera_vehicle size", "autopilot parameters", "disk")
     for name in names:
         assert f" {name}: " in result.output, result.output
+
+
+@pytest.mark.parametrize(
+    ("rig", "packets_per_s"),
+    [
+        ("puck_hi_res", 754),
+        ("vlp_32c", 1507),
+        ("hdl_32e", 1808),
+        ("xt16", 2500),
+        ("xt32", 2500),
+        ("os0_32_example", 640),
+        ("os1_32_example", 640),
+    ],
+)
+def test_a_lidar_of_each_model_passes_over_udp(bench, emulator, rig, packets_per_s):
+    graph = bench.write(emulator.path, rig)
+    unit = RigLidar.model_validate(graph.nodes["detect"].config["unit"])
+    with SendingLidar(bench.ports["lidar"], unit), bench.drone():
+        found = results_of(graph)
+    lidar = {name: verdict for name, verdict in found.items() if name.startswith("lidar")}
+    assert is_go(lidar.values()), lidar
+    assert {"lidar rate", "lidar losses", "lidar return mode"} <= lidar.keys()
+    measured = int(lidar["lidar rate"].sentence.split()[0])
+    assert measured == pytest.approx(packets_per_s, rel=0.03)
 
 
 def test_a_silent_rig_fails_for_each_device(bench, emulator):

@@ -1,7 +1,8 @@
 """Estimate of the drone by IMU: a bank of yaw hypotheses until the heading is decided, then a factor graph.
 
 Measurements are used in order of time, up to the horizon (measurement_queue.py). The published state is propagated from
-the horizon by the IMU. A measurement that arrives after the horizon has passed its time is moved to the horizon.
+the horizon by the IMU. A position that arrives after the horizon has passed its time is moved to the horizon by the
+estimated velocity; the horizon then waits for the next ones.
 
 The heading of a lost drone is remembered and propagated by the gyroscope: it is one hypothesis when a drone is found.
 
@@ -18,7 +19,7 @@ from stages.fuse.consistency import InformationInflation, Rejected, inflation
 from stages.fuse.cues.cue_fusion import SEEN_NS, CueFusion
 from stages.fuse.fix_covariance import FixCovariance, fix_covariance
 from stages.fuse.graph import InertialGraph
-from stages.fuse.measurement_queue import Measurement, MeasurementQueue
+from stages.fuse.measurement_queue import LATEST_NS, Measurement, MeasurementQueue
 from stages.fuse.settings import FuseErrors
 from stages.geometry.frames import Array64
 from stages.geometry.se3 import CHI2_999_3, mahalanobis2
@@ -28,7 +29,7 @@ from stages.heading.earlier_run import EarlierRun
 from stages.heading.heading_memory import HeadingMemory
 from stages.heading.imu_buffer import ImuBuffer
 from stages.heading.inertial_heading import InertialHeading, bias_free_turn, turn_between
-from stages.heading.inertial_state import POSITION, InertialState
+from stages.heading.inertial_state import POSITION, VELOCITY, InertialState
 from stages.heading.odometry_heading import OdometryHeading, OdomYaw
 from stages.heading.ownership import Ownership, log_evidence
 from stages.heading.rotation_matches import RotationMatches, combine
@@ -37,7 +38,6 @@ from stages.messages import CueFactor, DroneCue, DroneFix, DroneMotion, Relative
 TILT_TIME_S = 20.0  # time constant of the error of roll and pitch
 KEPT_NS = 15_000_000_000  # without a LiDAR position the estimate ends; the heading is remembered
 FREE_NS = 1_000_000_000  # without IMU and vanishing points the yaw is dropped after this time
-LATEST_NS = 500_000_000  # a measurement that is older than the state by more is not used
 LATE_MPS2 = 1.5  # change of velocity that moving a late position to the state's time ignores
 
 
@@ -224,7 +224,8 @@ class Estimator:
         v = state.velocity_mps[0]
         noise = covariance.white * self._fix_inflation.factor(stamp_ns) + (self._errors.clock_s**2) * np.outer(v, v)
         measured, z = z, z + late_s * v
-        noise = noise + (0.5 * LATE_MPS2 * late_s**2) ** 2 * np.eye(3)
+        moved_m2 = late_s**2 * state.covariance[0, VELOCITY, VELOCITY] + (0.5 * LATE_MPS2 * late_s**2) ** 2 * np.eye(3)
+        noise = noise + moved_m2
         off = z - state.xyz_m[0]
         nis = mahalanobis2(off, state.covariance[0, POSITION, POSITION] + noise)
         if nis > CHI2_999_3 and self._agrees_by_imu(stamp_ns, z, noise):

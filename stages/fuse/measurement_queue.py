@@ -1,7 +1,7 @@
 """Measurements that wait for their time: they are used in order of time, up to the horizon.
 
-The horizon is the time up to which the motions of the drone and of the vehicle are measured. Without an IMU the images
-of the drone measure its motion.
+The horizon is the time up to which the motions of the drone and of the vehicle are measured. It waits for LiDAR
+positions as long as the newest of them took to arrive. Without an IMU the images of the drone measure its motion.
 
 Source: ours; DESIGN, Fusion: late data attach at their own time.
 """
@@ -9,12 +9,15 @@ Source: ours; DESIGN, Fusion: late data attach at their own time.
 from __future__ import annotations
 
 import heapq
+from collections import deque
 
 from stages.geometry.trajectory import VehicleTrajectory
 from stages.heading.imu_buffer import ImuBuffer
 from stages.messages import DroneCue, DroneFix, RelativeRotation, VisualMotion
 
-DELAY_NS = 100_000_000  # measurements arrive at most this long after their stamp
+DELAY_NS = 100_000_000  # measurements arrive at least this long after their stamp: assumed,
+LATEST_NS = 500_000_000  # and positions that arrive later than this are not used
+FIXES = 10  # newest positions whose delay counts
 VEHICLE_NS, WAIT_NS = 60_000_000, 350_000_000  # extrapolation of the vehicle's pose; longest wait for a newer one
 IMAGE_NS = 300_000_000  # without an IMU, longest wait for the drone's next image
 Measurement = DroneFix | RelativeRotation | VisualMotion | DroneCue
@@ -26,11 +29,14 @@ class MeasurementQueue:
     def __init__(self, imu: ImuBuffer, vehicle: VehicleTrajectory) -> None:
         self._imu, self._vehicle = imu, vehicle
         self._waiting: list[tuple[int, int, Measurement]] = []
-        self._count = 0
+        self._count, self._now_ns = 0, 0
+        self._delays_ns: deque[int] = deque([DELAY_NS], maxlen=FIXES)
 
     def add(self, measurement: Measurement) -> None:
         """Add a measurement."""
         self._count += 1
+        if isinstance(measurement, DroneFix) and self._now_ns:
+            self._delays_ns.append(min(max(self._now_ns - measurement.stamp_ns, DELAY_NS), LATEST_NS))
         heapq.heappush(self._waiting, (measurement.stamp_ns, self._count, measurement))
 
     def clear(self) -> None:
@@ -45,11 +51,12 @@ class MeasurementQueue:
         return ready
 
     def horizon_ns(self, now_ns: int) -> int:
-        """Time up to which the motion of the drone and of the vehicle is measured."""
+        """Time up to which the motion of the drone and of the vehicle is measured and positions have arrived."""
+        self._now_ns = now_ns
         newest_ns, image_ns = self._imu.newest_ns, self._imu.newest_image_ns
         horizon_ns = now_ns
         if newest_ns is not None and self._imu.is_current(now_ns):
-            horizon_ns = min(newest_ns, now_ns - DELAY_NS)
+            horizon_ns = min(newest_ns, now_ns - max(self._delays_ns))
         elif image_ns is not None and now_ns - image_ns < IMAGE_NS:
             horizon_ns = min(image_ns, now_ns)
         vehicle_ns = self._vehicle.newest_ns if self._vehicle.known_at(now_ns) else None

@@ -14,7 +14,7 @@ from stages.fuse import Fuse
 from stages.messages import DroneMotion, PoseEstimate, PoseState, PositionEstimate, TrackingState
 from tests.stages.fuse.fuse_inputs import clocked, fix, late, poses_of, rotation, servo, track, without
 from tests.stages.fuse.imu_flights import ImuFlight, S, ns, seconds
-from tests.stages.fuse.judged import fly, rms
+from tests.stages.fuse.judged import CHI2_95, fly, rms
 
 FULL, COASTING, LOST = PoseState.FULL, PoseState.COASTING, PoseState.LOST
 PORTS = ("fix", "rotation", "visual_motion", "drone_motion", "motion")
@@ -87,6 +87,16 @@ def test_each_input_may_be_300_ms_late(flight, port):
     error_m = np.array(behind.error_m)[np.array(behind.at_s) > 6.0]
     assert np.percentile(error_m, 95) < 0.35
     assert rms(np.array(behind.yaw_deg)) < 3.0
+
+
+def test_positions_that_arrive_late_leave_the_pose_as_uncertain_as_stated():
+    """By IMU alone, with the heading unknown at first: each position has to count at its own time."""
+    nees = []
+    for seed in (1, 2, 3):
+        behind = fly(ImuFlight(kind="square", seed=seed, until_s=12.0), fault=late(("fix",), 0.4))
+        nees += behind.nees_position
+        assert len(behind.nees_position) > 300
+    assert np.mean(np.array(nees) < CHI2_95) > 0.93
 
 
 def test_a_reported_bias_of_the_fixes_does_not_average_out():

@@ -130,6 +130,8 @@ class RealTimeRig:
         if rig.lidar_model is not None and rig.lidar_model != scenario.rig.model:
             lidar = {"model": rig.lidar_model, "mount": scenario.rig.mount}
             overrides["rig"] = lidar if rig.lidar_beams is None else {**lidar, "beams": rig.lidar_beams}
+            if rig.lidar_beams is not None and rig.lidar_beams.packets.endswith("_DUAL"):
+                overrides["lidar"] = scenario.lidar.model_copy(update={"return_mode": "dual"})
         scenario = scenario.changed(**{name: value for name, value in overrides.items() if value is not None})
         self._rig, self._folder = rig, folder
         if rig.images is None:  # nothing reads its cameras
@@ -200,7 +202,8 @@ class RealTimeRig:
         odometry = next(
             (source for source in simulation.telemetry_sources if isinstance(source, VehicleOdometry)), None
         )
-        batch_ns = rig.batch_packets * simulation.packet_ns
+        batch_packets = max(round(1e9 * rig.batch_s / simulation.packet_ns), 1)
+        batch_ns = batch_packets * simulation.packet_ns
         first_ns, end_ns = scenario.start_ns, scenario.start_ns + round(1e9 * scenario.duration_s)
         poses: list[tuple[int, int, bytes]] = []  # (arrival, stamp, data)
         position_ns = 0  # due time of the next position packet
@@ -208,7 +211,7 @@ class RealTimeRig:
         while first_ns + batch_ns <= end_ns:
             behind_ns = simulation.now_ns() - first_ns
             if behind_ns > SKIP_NS:
-                skipped = behind_ns // simulation.packet_ns - rig.batch_packets
+                skipped = behind_ns // simulation.packet_ns - batch_packets
                 self.skipped += skipped
                 first_ns += skipped * simulation.packet_ns
             next_ns = first_ns + batch_ns
@@ -217,7 +220,7 @@ class RealTimeRig:
             if rig.position_port is not None and next_ns >= position_ns:
                 udp.sendto(encode_position(host_time.now_ns()), (LOOPBACK, rig.position_port))
                 position_ns = next_ns + POSITION_NS
-            packets, truth = simulation.batch(first_ns, rig.batch_packets)
+            packets, truth = simulation.batch(first_ns, batch_packets)
             for packet in packets:
                 udp.sendto(packet.data, (LOOPBACK, rig.lidar_port))
                 self.late.add(max(simulation.now_ns() - packet.stamp_ns - simulation.packet_ns, 1))

@@ -56,7 +56,7 @@ class LiveRigSettings(Settings):
     camera_ports: dict[CameraMount, Port] = Field(
         default_factory=dict[CameraMount, Port]
     )  # http://127.0.0.1:PORT/ of each
-    batch_packets: int = Field(8, ge=1, le=64)  # cast together: small batches have less latency, large ones cost less
+    batch_s: float = Field(0.01, gt=0, le=0.1)  # of packets cast together: long batches have more latency, cost less
 
 
 class LiveRig(Tap[LiveRigSettings]):

@@ -146,6 +146,14 @@ class Scenario(StrictModel):
         return self
 
     @model_validator(mode="after")
+    def _packets_hold_the_returns(self) -> Self:
+        if self.rig.model.startswith("OS") and self.rig.beams is not None:
+            mode = "dual" if self.rig.beams.packets.endswith("_DUAL") else "strongest"
+            if self.lidar.return_mode != mode:
+                raise ValueError(f"lidar.return_mode: {self.rig.beams.packets} packets hold {mode} returns: set {mode}")
+        return self
+
+    @model_validator(mode="after")
     def _can_be_flown(self) -> Self:
         if self.drone is None and self.autopilot is not None:
             raise ValueError("autopilot: the scenario has no drone for it; add one, or leave out the autopilot")

@@ -109,10 +109,13 @@ def test_the_rig_sends_current_packets_and_its_rays_follow_the_servo(tmp_path, p
     assert json.loads(poses[0].data)["xyz_m"] == [5.0, 2.0, 9.0]
 
 
-OS1_32 = yaml.safe_load((ROOT / "configs" / "rigs" / "os1_32_example.yaml").read_text())["rig"]["lidar"]
+OS1_32, OS0_32_DUAL = (
+    yaml.safe_load((ROOT / "configs" / "rigs" / f"{name}_example.yaml").read_text())["rig"]["lidar"]
+    for name in ("os1_32", "os0_32")
+)
 
 
-@pytest.mark.parametrize("unit", [{"model": "XT16"}, OS1_32], ids=lambda unit: unit["model"])
+@pytest.mark.parametrize("unit", [{"model": "XT16"}, OS1_32, OS0_32_DUAL], ids=lambda unit: unit["model"])
 def test_the_rig_sends_the_packets_of_another_lidar(unit, tmp_path, ports):
     pytest.importorskip("embreex", reason="simulating needs embreex: pip install -e '.[simulate]'")
     from links.simulated.rig.live_process import RealTimeRig

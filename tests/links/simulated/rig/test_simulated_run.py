@@ -192,6 +192,10 @@ def test_the_committed_recording_is_small_and_states_its_origin() -> None:
         ({"start_utc": "2025-06-01T10:20:30"}, "give the time zone"),
         ({"drone": {"path": {"waypoints": [{"t_s": 0, "xyz_m": [5, 0, -1.6]}]}}}, "0.20 m above the road at 0.00 s"),
         ({"script": [{"do": "spin"}]}, "script.0: Input tag 'spin'"),
+        (
+            {"rig": {"model": "OS0-32"}, "lidar": {"return_mode": "dual"}},
+            "packets hold strongest returns: set strongest",
+        ),
     ],
 )
 def test_a_wrong_scenario_is_an_error_with_the_file_and_the_key(

@@ -15,8 +15,8 @@ from stages.geometry.trajectory import VehicleTrajectory
 from stages.heading.imu_buffer import ImuBuffer
 from stages.messages import DroneCue, DroneFix, RelativeRotation, VisualMotion
 
-DELAY_NS = 100_000_000  # measurements arrive at least this long after their stamp: assumed,
-LATEST_NS = 500_000_000  # and positions that arrive later than this are not used
+DELAY_NS = 100_000_000  # assumed: at least so long after their stamp positions arrive
+LATEST_NS = 500_000_000  # longest wait for them; a position that is older than the state by more is not used
 FIXES = 10  # newest positions whose delay counts
 VEHICLE_NS, WAIT_NS = 60_000_000, 350_000_000  # extrapolation of the vehicle's pose; longest wait for a newer one
 IMAGE_NS = 300_000_000  # without an IMU, longest wait for the drone's next image

@@ -1,7 +1,8 @@
 """Measurements that wait for their time: they are used in order of time, up to the horizon.
 
 The horizon is the time up to which the motions of the drone and of the vehicle are measured. It waits for LiDAR
-positions as long as the newest of them took to arrive. Without an IMU the images of the drone measure its motion.
+positions as long as the slowest of the newest ones took to arrive. Without an IMU the images of the drone measure its
+motion.
 
 Source: ours; DESIGN, Fusion: late data attach at their own time.
 """
@@ -15,8 +16,8 @@ from stages.geometry.trajectory import VehicleTrajectory
 from stages.heading.imu_buffer import ImuBuffer
 from stages.messages import DroneCue, DroneFix, RelativeRotation, VisualMotion
 
-DELAY_NS = 100_000_000  # assumed: at least so long after their stamp positions arrive
-LATEST_NS = 500_000_000  # longest wait for them; a position that is older than the state by more is not used
+DELAY_NS = 100_000_000  # least wait for positions, assumed
+LATEST_NS = 500_000_000  # longest wait; a position that is older than the state by more is not used
 FIXES = 10  # newest positions whose delay counts
 VEHICLE_NS, WAIT_NS = 60_000_000, 350_000_000  # extrapolation of the vehicle's pose; longest wait for a newer one
 IMAGE_NS = 300_000_000  # without an IMU, longest wait for the drone's next image

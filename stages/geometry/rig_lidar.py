@@ -32,6 +32,11 @@ class LidarBeams(StrictModel):
         None  # packets of another unit are refused; None: not checked
     )
 
+    @property
+    def return_mode(self) -> Literal["strongest", "dual"]:
+        """Ouster: the returns that its packets hold."""
+        return "dual" if self.packets.endswith("_DUAL") else "strongest"
+
 
 class RigLidar(StrictModel):
     """`rig.lidar`: an Ouster needs its `beams`; a Velodyne has none, a Hesai XT may have them."""

@@ -130,8 +130,8 @@ class RealTimeRig:
         if rig.lidar_model is not None and rig.lidar_model != scenario.rig.model:
             lidar = {"model": rig.lidar_model, "mount": scenario.rig.mount}
             overrides["rig"] = lidar if rig.lidar_beams is None else {**lidar, "beams": rig.lidar_beams}
-            if rig.lidar_beams is not None and rig.lidar_beams.packets.endswith("_DUAL"):
-                overrides["lidar"] = scenario.lidar.model_copy(update={"return_mode": "dual"})
+            if rig.lidar_beams is not None and rig.lidar_model.startswith("OS"):
+                overrides["lidar"] = scenario.lidar.model_copy(update={"return_mode": rig.lidar_beams.return_mode})
         scenario = scenario.changed(**{name: value for name, value in overrides.items() if value is not None})
         self._rig, self._folder = rig, folder
         if rig.images is None:  # nothing reads its cameras

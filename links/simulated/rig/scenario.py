@@ -148,7 +148,7 @@ class Scenario(StrictModel):
     @model_validator(mode="after")
     def _packets_hold_the_returns(self) -> Self:
         if self.rig.model.startswith("OS") and self.rig.beams is not None:
-            mode = "dual" if self.rig.beams.packets.endswith("_DUAL") else "strongest"
+            mode = self.rig.beams.return_mode
             if self.lidar.return_mode != mode:
                 raise ValueError(f"lidar.return_mode: {self.rig.beams.packets} packets hold {mode} returns: set {mode}")
         return self

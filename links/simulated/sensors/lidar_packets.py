@@ -58,7 +58,7 @@ class PacketEncoder:
             self.sequences = unit.beams.columns_per_packet
             self.sequence_ns = 1e9 / (unit.beams.columns * unit.beams.spin_hz)
             self.encode = self._ouster
-            if (mode == "dual") != unit.beams.packets.endswith("_DUAL") or mode == "last":
+            if mode != unit.beams.return_mode:
                 raise ValueError(f"packets {unit.beams.packets} do not hold return mode {mode}")
         elif unit.model.startswith("XT"):
             self.sequences = 8 // self.returns

@@ -13,7 +13,7 @@ import numpy as np
 from links.simulated.sensors.lidar_packets import PacketEncoder
 from stages.geometry.rig_lidar import RigLidar
 
-SPIN_RADPS = 20.0 * math.pi
+SPIN_RADPS = 20.0 * math.pi  # 600 rpm
 
 
 class SendingLidar:
@@ -35,8 +35,7 @@ class SendingLidar:
 
 def send(port: int, unit: RigLidar) -> None:
     """Every pulse returns from 10 m."""
-    dual = unit.beams is not None and unit.beams.packets.endswith("_DUAL")
-    encoder = PacketEncoder(unit, "dual" if dual else "strongest")
+    encoder = PacketEncoder(unit, "strongest" if unit.beams is None else unit.beams.return_mode)
     shape = (encoder.returns, encoder.sequences, encoder.profile.lasers)
     range_m, reflectivity = np.full(shape, 10.0), np.full(shape, 50, np.uint8)
     after_s = 1e-9 * encoder.sequence_offsets_ns(1)

@@ -182,6 +182,23 @@ def test_a_further_pair_that_stands_out_less_is_stated_as_weak():
     assert found.reason.startswith("2 horizontal frames (1 weak)")
 
 
+def test_a_board_with_more_lines_than_the_building_is_stated_as_weak_and_alone_it_is_not():
+    turned = rotation_z(np.radians(30.0))
+    on_all_sides = lines_along(turned[:, :2].T, each=300, seed=5)
+    middle = np.cross(on_all_sides.tangent, on_all_sides.normal)
+    near = np.abs(np.arctan2(middle[:, 1], middle[:, 0])) < np.radians(35.0)
+    board = Lines(*(getattr(on_all_sides, name)[near] for name in vars(on_all_sides)))
+    building = lines_along(np.vstack([np.eye(3), np.eye(3)[:2]]), each=12)
+    both = Lines(*(np.concatenate([getattr(building, name), getattr(board, name)]) for name in vars(board)))
+    found = find_structure(both, VerticalPrior(UP, np.radians(3), 0.0), LIMITS)
+    assert list(found.frame) == [-1, 0, 0, 1, 1]
+    for f, truth, sigma_deg in ((0, turned, 15.0), (1, np.eye(3), 0.0)):
+        assert (off_deg(truth.T, found.direction[found.frame == f].T).min(axis=0) < 0.5).all()
+        np.testing.assert_allclose(np.degrees(found.sigma_rad[found.frame == f]), sigma_deg, atol=0.5)
+    alone = find_structure(board, VerticalPrior(UP, np.radians(3), 0.0), LIMITS)
+    assert (np.degrees(alone.sigma_rad[alone.frame == 0]) < 1.0).all()
+
+
 @pytest.mark.parametrize(("apart_deg", "frames"), [(3.0, {-1, 0}), (7.0, {-1, 0, 1})])
 def test_pairs_are_separated_from_some_degrees_on(apart_deg, frames):
     nearby = rotation_z(np.radians(apart_deg))

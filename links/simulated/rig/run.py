@@ -125,6 +125,7 @@ class Simulation:
         shift_ns = round(scenario.mount.servo_time_offset_s * 1e9)
         self._servo = ServoBus(scenario.servo, commander, scenario.start_ns, shift_ns, self.seed)
         self._arrival = np.random.default_rng([self.seed, 5])
+        self._packet_arrival_ns = 0  # of the newest LiDAR packet: datagrams on one cable keep their order
         self._cameras: Sequence[Camera | CachedCamera] = (
             self._rendered_cameras() if images is None else images.cameras(self.truth)
         )
@@ -287,12 +288,14 @@ class Simulation:
         shades = pulses.reflectivity.reshape(ranges.shape)
         jitter_ns = self._arrival.uniform(3e5, 8e5, packets).astype(np.int64)
         last_pulse_ns = pulse_ns.reshape(packets, -1)[:, -1]
+        arrivals_ns = np.maximum.accumulate(np.maximum(last_pulse_ns + jitter_ns, self._packet_arrival_ns))
+        self._packet_arrival_ns = int(arrivals_ns[-1])
         records: list[Record] = []
         for i in range(packets):
             at = first_ns + i * packet_ns
             data = self.encoder.encode(at + self.lidar_clock_ns, azimuth[i], ranges[:, i], shades[:, i])
-            arrival_ns = int(last_pulse_ns[i] + jitter_ns[i])
-            records.append(Record("/lidar/packets", arrival_ns=arrival_ns, stamp_ns=at // 1000 * 1000, data=data))
+            stamp_ns = at // 1000 * 1000
+            records.append(Record("/lidar/packets", arrival_ns=int(arrivals_ns[i]), stamp_ns=stamp_ns, data=data))
         return records + self._truth_records.hits(pulse_ns.reshape(packets, -1), pulses)
 
 

@@ -132,6 +132,13 @@ def test_dual_return_packets_hold_half_the_firings(short: Scenario) -> None:
     assert {0, 1} in kinds
 
 
+def test_packets_closer_than_their_delays_differ_arrive_in_order(short: Scenario) -> None:
+    fast = short.changed(duration_s=0.2, rig={"mount": short.mount, "model": "XT32"})  # a packet every 0.4 ms
+    stamps_ns = [r.stamp_ns for r in Simulation(fast).records() if r.topic == "/lidar/packets"]
+    assert len(stamps_ns) == 500
+    assert stamps_ns == sorted(stamps_ns)
+
+
 def test_an_empty_sky_has_no_drone_in_truth_or_returns() -> None:
     scenario = load_scenario(ROOT / "configs/scenarios/empty_street.yaml").changed(duration_s=0.2)
     simulation = Simulation(scenario)

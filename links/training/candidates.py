@@ -46,7 +46,7 @@ class CandidateRows:
     logged: Array64  # (n,) probability that the run itself gave
     candidate: NDArray[np.int64]  # (n,) number over all runs
     seed: NDArray[np.int64]  # (n,) of the recording
-    run: NDArray[np.int64]  # (n,) index of the run
+    recording: NDArray[np.int64]  # (n,) number; the same for all runs of a recording
     stamp_ns: NDArray[np.int64]  # (n,)
 
     def take(self, rows: Flags) -> CandidateRows:
@@ -79,7 +79,7 @@ def read_candidates(runs: Sequence[Path], thin: bool = True, workers: Workers = 
         logged=frame.probability.to_numpy(dtype=np.float64),
         candidate=frame.groupby(["run", "detector_instance", "candidate"]).ngroup().to_numpy(dtype=np.int64),
         seed=frame.seed.to_numpy(dtype=np.int64),
-        run=frame.run.to_numpy(dtype=np.int64),
+        recording=np.unique(frame.recording, return_inverse=True)[1].astype(np.int64),
         stamp_ns=frame.stamp_ns.to_numpy(dtype=np.int64),
     )
 
@@ -134,7 +134,8 @@ def read_one(task: ReadTask, report: Callable[[float], None]) -> pd.DataFrame:
             raise LinkError(f"{file}:{row + 2}: {name} is {text}; replay the recording with this version of grd")
     frame["stamp_ns"] = [int(s) * 10**9 + int(f.ljust(9, "0")) for s, f in (t.split(".") for t in frame.stamp_s)]
     known, frame["is_drone"] = _labels(folder, frame)
-    frame = frame.assign(run=index, seed=_seed(folder)).loc[known]
+    recording, seed = _recording(folder)
+    frame = frame.assign(run=index, recording=recording, seed=seed).loc[known]
     if thin:
         number = frame.groupby(["detector_instance", "candidate"]).cumcount().to_numpy()
         step = np.floor(np.log(np.maximum(number, FIRST_ROWS) / FIRST_ROWS) / np.log(SPARSER))
@@ -143,12 +144,12 @@ def read_one(task: ReadTask, report: Callable[[float], None]) -> pd.DataFrame:
     return frame
 
 
-def _seed(folder: Path) -> int:
-    """Seed of the recording, by the name of the run: rows of one seed must not be on both sides of a split."""
+def _recording(folder: Path) -> tuple[str, int]:
+    """The recording and its seed, by the name of the run: rows of one must not be on both sides of a split."""
     found = SEED.search(folder.name)
     if found is None:
         raise LinkError(f"{folder}: the name of the run must contain the seed of its recording, as in park-s7-detector")
-    return int(found[1])
+    return folder.name[: found.end(1)], int(found[1])
 
 
 def _labels(folder: Path, frame: pd.DataFrame) -> tuple[Flags, Flags]:

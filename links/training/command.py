@@ -28,7 +28,7 @@ LIBRARIES = ("numpy", "scipy", "pandas")
 
 @report_errors
 def train_detector(
-    runs: Annotated[list[Path], typer.Argument(help="Folders of runs of simulated flights; split by their seeds.")],
+    runs: Annotated[list[Path], typer.Argument(help="Folders of runs of simulated flights; split by recording.")],
     out_file: Annotated[
         Path, typer.Option("--out", "-o", help="Weights file to write, as configs/models/detector.yaml.")
     ],

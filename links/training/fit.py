@@ -97,14 +97,14 @@ def train(
     `start`: a model of other rows; the penalty pulls to its weights. `strengths`: of the penalty, to choose from (None:
     STRENGTHS).
     """
-    if min(rows.is_drone.sum(), (~rows.is_drone).sum()) < 100 or len(np.unique(rows.seed)) < 2:
-        raise LinkError("training needs at least 100 rows of drones, 100 of others, and two seeds")
+    if min(rows.is_drone.sum(), (~rows.is_drone).sum()) < 100 or len(np.unique(rows.recording)) < 2:
+        raise LinkError("training needs at least 100 rows of drones, 100 of others, and two recordings")
     easy = ~rows.is_drone & ~rows.with_telemetry & (rows.feature("scan_passes") <= 1)
     kept = ~easy | (np.random.default_rng(0).uniform(size=len(easy)) < EASY_SHARE)
     weight = np.where(easy, 1.0 / EASY_SHARE, 1.0)[kept]
     columns = _columns(rows.take(kept), left_out, start)
     A, y = _design(rows.X[kept], columns), rows.is_drone[kept]
-    fold = rows.run[kept] % FOLDS
+    fold = rows.recording[kept] % FOLDS
     strengths = strengths or STRENGTHS
     several = strengths if len(strengths) > 1 else ()
     losses = {strength: _left_out_loss(A, y, weight, fold, columns, strength) for strength in several}
@@ -259,7 +259,7 @@ def _left_out_loss(
     columns: Sequence[_Column],
     strength: float,
 ) -> float:
-    """Log loss over folds of seeds, each by a fit to the others."""
+    """Log loss over folds of recordings, each by a fit to the others."""
     total = 0.0
     for k in np.unique(fold):
         own, other = fold != k, fold == k

@@ -64,6 +64,14 @@ def test_a_candidate_at_the_drone_is_a_drone_and_the_name_has_the_seed(runs):
     assert rows.logged.tolist() == [0.5] * len(rows.X)
 
 
+def test_runs_of_one_recording_are_on_the_same_side_of_a_split(tmp_path):
+    names = ["park-20m-s1-detector", "park-20m-s1-imu_only", "park-20m-s2-detector", "campus-20m-s1-detector"]
+    rows = read_candidates([write_run(tmp_path / name, k, candidates=4) for k, name in enumerate(names)])
+    first, again, *others = (np.unique(rows.recording[24 * k : 24 * k + 24]) for k in range(4))
+    assert first.tolist() == again.tolist()
+    assert len(np.unique([first, *others])) == 3
+
+
 def test_later_rows_of_a_candidate_are_used_more_sparsely(tmp_path):
     run = write_run(tmp_path / "x-s1-y", 1, candidates=3, rows=200)
     thin, every = read_candidates([run]), read_candidates([run], thin=False)
@@ -163,7 +171,7 @@ def test_runs_that_cannot_be_used_are_named(tmp_path, runs):
         read_candidates([tmp_path])
     with pytest.raises(LinkError, match="no feature calm_s"):
         read_candidates([write_run(tmp_path / "old-s1-x", 1, drop=("calm_s",))])
-    with pytest.raises(LinkError, match="two seeds"):
+    with pytest.raises(LinkError, match="two recordings"):
         train(read_candidates(runs[:1]), {})
 
 

@@ -32,7 +32,7 @@ def main() -> None:
         run = Path(folder) / "run"
         command = [sys.executable, "-c", "from links.cli import main; main()", "replay", "recordings/street_sweep.mcap"]
         options = ["--config", "configs/estimate.yaml", "--set", "detect.parked=true", "--out", str(run)]
-        options += ["--set", "detect.model=null"]  # nothing is known of this drone
+        options += ["--set", "detect.accept_probability=0.5"]  # nothing is known of this drone
         subprocess.run([*command, *options], cwd=ROOT, check=True)
         animate_replay(run, IMAGES / "replay.gif")
 

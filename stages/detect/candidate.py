@@ -1,7 +1,7 @@
 """One candidate: a constant-velocity Kalman filter and the evidence that its observations have added.
 
-The filter estimates position and velocity in the map frame, with equal variances on the three axes. The classifier
-(`stages/detect/classifier.py`) computes the log-odds of a drone from the counters kept here.
+The filter estimates position and velocity in the map frame, with equal variances on the three axes. The counters kept
+here become features (`stages/detect/trained/features.py`), from which the model computes the log-odds of a drone.
 
 Source: ours; DESIGN, "evaluated as data arrives".
 """
@@ -33,7 +33,6 @@ SOME_RETURNS_M = 36.0  # over range: counts up to this one are ambiguous, a wire
 SINGLE_RETURN_NATS = -1.0  # threshold of `Candidate.return_count_nats` below which `returns_singly` is true
 STATIC_M = 0.6  # a static object is observed again within this distance
 OPEN_NEIGHBOUR_SCORE = 0.5  # a lower `Candidate.neighbour_score` means open air around it
-WIRE_M, SINGLE_RETURN_WIRE_M = 20.0, 30.0  # to these ranges a wire returns pulses; several a scan pass, and one
 START_SPEED_MPS = 6.0  # one sigma about the vehicle's own velocity
 
 
@@ -74,7 +73,6 @@ class Candidate:
     p: tuple[float, float, float]  # variances: position, position-velocity, velocity
     first_returns: int
     scan_passes: int = 1  # passes of the rotor in which it was observed
-    missed_returns: float = 0.0  # expected returns that did not come
     existence_nats: float = 0.0  # log-odds that one object causes its observations, see trained/existence.py
     false_per_s: float = LEAST_FALSE_PER_S  # rate of false returns at its range, at its last observation
     observations: int = 0
@@ -94,14 +92,13 @@ class Candidate:
     large_object_passes: int = 0
     large_object_m: float = math.inf
     seen_ns: int = 0
-    log_odds: float = 0.0  # newest result of the classifier, cues included
+    log_odds: float = 0.0  # newest result of the model, cues included
     own_log_odds: float = 0.0  # without cues
     cue_nats: float | None = None  # what cues add to it; None: no cue yet
     cue_ns: int = 0  # when that was computed
     proven_cues: set[str] = field(default_factory=set[str])  # sources of the cues that are proven to be of it
     reason: str = ""  # for people
-    alternative: Alternative | None = None  # the most probable one; None: not classified yet
-    rejection: str = ""  # the alternative and the kinds of reasons for it, for people
+    alternative: Alternative = Alternative.FALSE_RETURN  # the most probable one at its newest classification
     near_rejected: bool = False  # something was rejected near its first position
     revisited: bool = False  # something was rejected at its first position, while the drone reports that it flies
     reacquired_at: int = 0  # scan passes before it was reacquired at another position; 0: never
@@ -111,7 +108,6 @@ class Candidate:
     is_promising: bool = False  # probable enough for further observation
     was_promising: bool = False  # it was promising once, so its further fate is published
     calm_s: float = 0.0  # time in which it significantly flew more calmly than any bird
-    steady_s: float = 0.0  # how long it significantly flew straight
     path_ns: list[int] = field(default_factory=lambda: list[int]())
     path_m: list[Array64] = field(default_factory=lambda: list[Array64]())
     relative_path_m: list[Array64] = field(default_factory=lambda: list[Array64]())  # relative to the vehicle
@@ -218,7 +214,6 @@ class Candidate:
         displacement_m = float(np.linalg.norm(self.path_m[-1] - self.path_m[-2]))
         flown = self.slower_motion
         if flown is not None:
-            self.steady_s += min(since_s, 0.2) * flown.steady
             self.fastest_mps = max(self.fastest_mps, flown.speed_mps - 1.5 * flown.speed_sigma_mps)
             self.hardest_mps2 = max(self.hardest_mps2, flown.acceleration_mps2 - 2.5 * flown.acceleration_sigma_mps2)
         if since_s > 0.4:
@@ -241,13 +236,3 @@ class Candidate:
     def moves(self, motion_known: bool) -> bool:
         """Whether it has significantly moved in the map frame; see `stages/detect/flight.py`."""
         return moves(self.path_ns, self.path_m, self.range_m, motion_known)
-
-
-def over_visible_support(c: Candidate, ratios: MotionLogRatios, wire_m: float, single_return_wire_m: float) -> float:
-    """Log ratio [nats] of telemetry over the static object that would be visible at the candidate's range.
-
-    A wire to `wire_m`, or to `single_return_wire_m` if the candidate returns singly. Beyond, a wire returns few pulses
-    or none: a static object.
-    """
-    wire = c.range_m < (single_return_wire_m if c.returns_singly else wire_m)
-    return ratios.over_wire if wire else ratios.over_static

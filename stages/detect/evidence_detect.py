@@ -29,15 +29,14 @@ from stages.cues.evidence import CueEvidence, CueWeights, ObjectPath, ObjectStat
 from stages.detect.candidate import SAME_PASS_NS, START_SPEED_MPS, STATIC_M, Alternative, Candidate, Observation
 from stages.detect.candidate_messages import candidate_log, candidates_message, detections_message, log_odds_of
 from stages.detect.candidate_table import CandidateTable, positions_of
-from stages.detect.classifier import ClassifierWeights, classify
 from stages.detect.flight import scatter_m
 from stages.detect.isolation import LargeObjectMap
 from stages.detect.observations import ObservationFinder, ObservationLimits, Slice
 from stages.detect.reacquire import reacquired_candidate, without_duplicates
 from stages.detect.telemetry import DetectorTelemetry
-from stages.detect.trained.existence import FalseReturns, birth_nats, passed_nats, range_share
+from stages.detect.trained.existence import FalseReturns, birth_nats, passed_nats
 from stages.detect.trained.features import FREE_SPACE, features_of
-from stages.detect.trained.model import DetectorModel, reasons_of
+from stages.detect.trained.model import ALTERNATIVES, DetectorModel, reasons_of
 from stages.geometry.frames import Array64
 from stages.geometry.rig_lidar import RigLidar
 from stages.geometry.trajectory import VehicleTrajectory
@@ -115,7 +114,7 @@ class EvidenceDetectSettings(Settings):
     nearest_m: float = Field(1.5, ge=0.3)  # least range of candidates
     furthest_m: float = Field(65.0, gt=1)  # greatest range of candidates
     clear_m: float = Field(2.0, gt=0.2)  # radius that must be free; a lamp is this far from its pole
-    accept_probability: float = Field(0.95, gt=0.5, lt=1)  # at which a candidate is accepted as a drone
+    accept_probability: float = Field(0.95, ge=0.5, lt=1)  # at which a candidate is accepted as a drone
     follow_up_probability: float = Field(0.014, gt=0, lt=0.5)  # at which a candidate is published for more observations
     report_s: float = Field(1.0, gt=0.05)  # longest time between messages while a drone is accepted; else 3 times it
     settle_s: float = Field(0.15, ge=0)  # delay of a pass's report, so that its last observations are complete
@@ -124,9 +123,15 @@ class EvidenceDetectSettings(Settings):
     max_candidates: int = Field(12, ge=1)  # per published message
     parked: bool = False  # the vehicle does not move: motion is known without VehicleMotion
     free_space: bool = True  # ablation: False ignores the measured surroundings
-    weights: ClassifierWeights = ClassifierWeights()  # log likelihood ratios of the classifier
     cues: CueWeights = CueWeights()  # what GNSS, ranging and barometer may add
-    model: DetectorModel | None = None  # by `grd train-detector`, configs/models; null: the classifier by `weights`
+    model: DetectorModel  # by `grd train-detector`; configs/models/detector.yaml
+
+    @model_validator(mode="before")
+    @classmethod
+    def _has_a_model(cls, values: dict[str, Any]) -> dict[str, Any]:
+        if values.get("model") is None:
+            raise ValueError("it has no model: include models/detector.yaml")
+        return values
 
     @model_validator(mode="after")
     def _settings_agree(self) -> EvidenceDetectSettings:
@@ -171,7 +176,7 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
         self._now.telemetry.add_odometry(odometry)
 
     def on_drone_motion(self, motion: DroneMotion) -> None:
-        """Add an interval of the drone's IMU, a feature of the trained model."""
+        """Add an interval of the drone's IMU, which is evidence where telemetry is not compared."""
         self._now.telemetry.add_motion(motion)
 
     def on_cue(self, cue: DroneCue) -> CueState:
@@ -247,7 +252,7 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
             new.velocity_mps = now.trail.velocity_mps(s.stamp_ns)  # a drone follows the vehicle
             now.table.put(new)
         else:
-            now.rejected[new.rejection] += 1
+            now.rejected[new.alternative.value] += 1
             now.false_returns.add(new.range_m, new.seen_ns)
             self._remember_rejected(now, new)
         return changed
@@ -293,22 +298,17 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
         c.features = features_of(c, settings.span_m, motion_known)
         if not settings.free_space:
             c.features[list(FREE_SPACE)] = math.nan
-        prediction = None
-        if settings.model is not None:
-            prediction = settings.model.classify(c)
-            c.log_odds, c.reason = prediction.log_odds, ""
-        else:
-            c.log_odds, c.reason = classify(c, settings.weights, settings.free_space, motion_known)
-        c.own_log_odds = c.log_odds
+        prediction = settings.model.predict(c.features)
+        c.alternative = ALTERNATIVES[prediction.alternative]
+        c.log_odds = c.own_log_odds = prediction.log_odds
         remark = self._add_cues(now, c)
         now.classified[c.number] = c
         accept = self._accept_nats
         c.accepted = c.log_odds >= accept or (c.accepted and c.own_log_odds >= accept - HYSTERESIS_NATS)
         before, c.is_promising = c.is_promising, c.log_odds >= self._follow_up_nats
         c.was_promising |= c.is_promising
-        if prediction is not None and (c.is_promising or c.observations > 1):  # others are rejected at once
-            c.reason = reasons_of(c.features, prediction)
-        c.reason += remark
+        named = c.is_promising or c.observations > 1  # others are rejected at once
+        c.reason = (reasons_of(c.features, prediction) if named else "") + remark
         return c.was_promising or before != c.is_promising
 
     def _add_cues(self, now: _State, c: Candidate) -> str:
@@ -357,7 +357,6 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
             if watch is not None and now_ns - watch.stamp_ns > SAME_PASS_NS:
                 if watch.returns == 0 and now_ns - c.seen_ns > 2 * SAME_PASS_NS:
                     c.existence_nats += passed_nats(c.range_m, watch.pass_throughs)
-                    c.missed_returns += watch.pass_throughs * range_share(c.range_m)
                     self._classify(now, c)
                     now.table.put(c)
                 del now.watches[c.number]

@@ -17,7 +17,6 @@ from stages.geometry.frames import Array64
 BIRD_TURN_S = 1.4  # of speed over acceleration: a turn in 9 s
 CALM_MPS = 6.5  # a bird is faster, including the speed that a turn hides
 SLOW_MPS = 2.0
-STEADY_MPS2 = 2.0
 RECENT_NS = 1_200_000_000
 PAUSE_S = 0.45  # without an observation
 LAMP_RANGE_M, LAMP_SWAY_M = (25.0, 28.0), (0.0, 1.5)
@@ -43,7 +42,6 @@ class Motion(NamedTuple):
     speed_sigma_mps: float  # an axis
     acceleration_mps2: float
     acceleration_sigma_mps2: float  # an axis
-    spread_m: float  # of its observations about the parabola
 
     @property
     def top_sigma_mps(self) -> float:
@@ -60,11 +58,6 @@ class Motion(NamedTuple):
         """Whether no bird flies like that: slowly, and not as just before or after a turn."""
         slow = self.speed_mps + 1.5 * self.speed_sigma_mps < SLOW_MPS
         return slow or self.top_mps + self.top_sigma_mps < CALM_MPS
-
-    @property
-    def steady(self) -> bool:
-        """Whether it significantly flies straight."""
-        return self.acceleration_mps2 + self.acceleration_sigma_mps2 < STEADY_MPS2
 
 
 def scatter_m(range_m: float) -> float:
@@ -97,15 +90,13 @@ def fit_motion(path_ns: list[int], paths_m: Sequence[list[Array64]], range_m: fl
     speed_sigma = math.sqrt(covariance[1, 1] + 2 * at * covariance[1, 2] + at**2 * covariance[2, 2])
     motions: list[Motion] = []
     for path_m in paths_m:
-        x = np.array(path_m[first:])
-        fit = covariance @ (A.T @ x) / sigma**2
+        fit = covariance @ (A.T @ np.array(path_m[first:])) / sigma**2
         motions.append(
             Motion(
                 speed_mps=float(np.linalg.norm(fit[1] + at * fit[2])),
                 speed_sigma_mps=speed_sigma,
                 acceleration_mps2=float(np.linalg.norm(fit[2])),
                 acceleration_sigma_mps2=math.sqrt(covariance[2, 2]),
-                spread_m=float(np.linalg.norm(x - A @ fit)) / math.sqrt(len(t)),
             )
         )
     return motions

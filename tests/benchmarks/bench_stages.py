@@ -18,7 +18,7 @@ import yaml
 from links.dynamixel import Servo
 from links.lidar import Lidar
 from links.recording import RecordingReader
-from stages.detect import EvidenceDetect, KernelDetect
+from stages.detect import KernelDetect
 from stages.detect.kernel_candidates import inner_half_px, score_image
 from stages.geometry.frames import LidarMount
 from stages.kernels.detect.kernel_score import kernel_terms
@@ -27,6 +27,7 @@ from stages.messages import Candidates, DepthImage, Detections, SweptPoints, Swe
 from stages.sweep.depth_image import focal_length_px
 from stages.sweep.sweep import Sweep
 from stages.track import LikelihoodTrack, MeanShiftTrack
+from tests.stages.detect.shipped import detector
 from tests.stages.made import MS, START_NS, depth_image, detections, street_depth, swept
 
 RECORDING = Path(__file__).resolve().parents[2] / "recordings" / "street_sweep.mcap"
@@ -183,7 +184,7 @@ def test_sweep(benchmark, street):
 @pytest.mark.benchmark(group="10 ms of packets: detect")
 def test_detect_by_evidence(benchmark, street):
     mount, slices, _ = street
-    sweep, stage = Sweep(mount=mount), EvidenceDetect()
+    sweep, stage = Sweep(mount=mount), detector()
     pulses = [of_kind(swept_by(sweep, part), SweptPulses) for part in slices]
     each_slice(benchmark, lambda part: fed(stage, "on_pulses", part), pulses)
 
@@ -219,7 +220,7 @@ def test_track_by_mean_shift(benchmark, street):
 @pytest.mark.benchmark(group="10 ms of packets: all three")
 def test_product_stages_together(benchmark, street):
     mount, slices, drone = street
-    sweep, detect, track = Sweep(mount=mount), EvidenceDetect(), LikelihoodTrack(lost_after_s=60.0)
+    sweep, detect, track = Sweep(mount=mount), detector(), LikelihoodTrack(lost_after_s=60.0)
     started(track, drone, slices[0][0].stamp_ns)
 
     def run(part):

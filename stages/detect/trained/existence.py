@@ -92,9 +92,4 @@ def detection_probability(range_m: float, pulses: float) -> float:
 
 
 def _returned(range_m: float) -> float:
-    return RETURNS_AT_MIDDLE * range_share(range_m)
-
-
-def range_share(range_m: float) -> float:
-    """Share of its pulses that a dark drone returns at a range, relative to those at close range."""
-    return min(1.0, (RETURNS_TO_M / range_m) ** 2)
+    return RETURNS_AT_MIDDLE * min(1.0, (RETURNS_TO_M / range_m) ** 2)

@@ -8,8 +8,8 @@ Each that a model uses is monotone: what has no sign by physics, as the range, c
 of the flights of a simulator than of the candidate. The range is logged only. What counts against a drone chord by
 chord or pass by pass is a share of them: their number would grow with the length of the flight.
 
-Features depend on the classifier of the run, which decides which candidates are kept and counted. Train on replays with
-the classifier that the model replaces, then again on replays with the model.
+Features depend on the model of the run, which decides which candidates are kept and counted. Train on replays with the
+model that the new one replaces, then again on replays with the new one.
 
 Source: ours.
 """
@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stages.detect.candidate import SINGLE_RETURN_WIRE_M, WIRE_M, Candidate, over_visible_support
+from stages.detect.candidate import Candidate
 from stages.detect.flight import Motion, straight_flight
 from stages.detect.motion_log_ratios import MotionLogRatios
 from stages.geometry.frames import Array64
@@ -29,6 +29,7 @@ from stages.geometry.frames import Array64
 VERSION = 8
 PULSE_RAD = math.radians(0.2)  # between two pulses of a laser: VLP-16, 600 rpm
 NONE_M = 4.0  # written where no large object is near
+WIRE_M, SINGLE_RETURN_WIRE_M = 20.0, 30.0  # to these ranges a wire returns pulses; several a scan pass, and one
 NOT_DISPLACED_NATS = 3.0  # cap of the log ratio over a static object that may seem to move as far
 
 
@@ -140,12 +141,14 @@ def features_of(c: Candidate, span_m: float, motion_known: bool) -> Array64:
 def displaced_nats(c: Candidate, ratios: MotionLogRatios) -> float:
     """Log ratio [nats] of telemetry over the static object that would be visible at the candidate's range.
 
-    A lamp whose pole is invisible, or a wire, may seem to move (`Candidate.apparent_motion_m`): a drone's odometry that
-    moved less is little evidence, unless the candidate agreed with it in open air before.
+    A wire to `WIRE_M`, or to `SINGLE_RETURN_WIRE_M` if the candidate returns singly; beyond, a static object. A lamp
+    whose pole is invisible, or a wire, may seem to move (`Candidate.apparent_motion_m`): a drone's odometry that moved
+    less is little evidence, unless the candidate agreed with it in open air before.
     """
-    nats = over_visible_support(c, ratios, WIRE_M, SINGLE_RETURN_WIRE_M)
+    wire = c.range_m < (SINGLE_RETURN_WIRE_M if c.returns_singly else WIRE_M)
+    nats = ratios.over_wire if wire else ratios.over_static
     moved = ratios.displacement_m > c.apparent_motion_m
     return max(nats if moved else min(nats, NOT_DISPLACED_NATS), c.flight_log_ratio)
 
 
-NOT_MEASURED = Motion(math.nan, math.nan, math.nan, math.nan, math.nan)
+NOT_MEASURED = Motion(math.nan, math.nan, math.nan, math.nan)

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flow.stage import StrictModel
-from stages.detect.candidate import Alternative, Candidate
+from stages.detect.candidate import Alternative
 from stages.detect.trained.features import FEATURES, NAMES, TELEMETRY, VERSION
 from stages.geometry.frames import Array64
 from stages.geometry.lidar_models import LidarModel
@@ -101,13 +101,6 @@ class DetectorModel(StrictModel):
         """Log-odds of a drone for features (len(FEATURES),)."""
         compared = not math.isnan(features[TELEMETRY])
         return Prediction(*evaluate(*self._tables, self._priors[int(compared)], features))
-
-    def classify(self, c: Candidate) -> Prediction:
-        """Whether the candidate is a drone by its `features`. Sets `c.alternative` and `c.rejection`."""
-        prediction = self.predict(c.features)
-        c.alternative = ALTERNATIVES[prediction.alternative]
-        c.rejection = c.alternative.value
-        return prediction
 
 
 def reasons_of(features: Array64, prediction: Prediction) -> str:

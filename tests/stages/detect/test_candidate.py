@@ -17,6 +17,7 @@ from stages.detect.candidate import (
     Candidate,
     Observation,
 )
+from stages.detect.motion_log_ratios import DENIED, MotionLogRatios
 from stages.kernels.detect.candidate import OPEN_PASSES
 from stages.kernels.detect.isolation import FARTHER_0, FREE_0, OCCUPIED_0, TALLY
 from tests.stages.made import START_NS
@@ -115,6 +116,54 @@ def test_a_long_path_outweighs_the_expected_velocity():
     (_, early), (_, late) = (c.predict_as_drone(c.stamp_ns, np.zeros(3), 3.0) for c in (few, many))
     assert early[0] < late[0]
     assert late[0] == pytest.approx(4.0, rel=0.15)
+
+
+# flight in open air that agrees with the drone's odometry
+
+
+def agreeing(displacement_m, over_static=20.0):
+    """Log ratios of a path that agrees with the odometry of a drone of this displacement."""
+    return MotionLogRatios(over_static, 20.0, 20.0, 15.0, misfit=0.0, displacement_m=displacement_m)
+
+
+def hovering(returns=3, range_m=20.0):
+    return candidate(*(observation(0.1 * k, returns=returns, range_m=range_m) for k in range(12)))
+
+
+@pytest.mark.parametrize(
+    ("range_m", "displacement_m", "flew"),
+    [(20.0, 0.3, True), (26.5, 0.6, False), (26.5, 0.9, True), (31.0, 1.2, False), (31.0, 2.0, True)],
+)
+def test_a_displacement_smaller_than_a_lamp_is_no_flight(range_m, displacement_m, flew):
+    """A lamp at 31 m, whose scattered observations match the motion of a drone that hovers at another position."""
+    c = hovering(range_m=range_m)
+    c.add_log_ratios(agreeing(displacement_m))
+    assert c.flight_log_ratio == (15.0 if flew else 0.0)
+
+
+@pytest.mark.parametrize(
+    ("range_m", "returns", "displacement_m", "flew"),
+    [(12.0, 1, 0.6, False), (12.0, 1, 2.0, True), (12.0, 5, 0.6, True), (20.0, 1, 0.6, True)],
+)
+def test_single_returns_along_a_wire_are_no_flight(range_m, returns, displacement_m, flew):
+    """Wires at 12 to 14 m, whose observations match the motion of a drone that hovers 40 m away."""
+    c = hovering(returns, range_m)
+    c.add_log_ratios(agreeing(displacement_m))
+    assert c.flight_log_ratio == (15.0 if flew else 0.0)
+
+
+def test_a_flight_in_open_air_counts_after_the_candidate_comes_near_an_object_unless_telemetry_contradicts_it():
+    c, beside = hovering(), hovering()
+    beside.neighbour_score = 1.0
+    beside.add_log_ratios(agreeing(9.0))
+    assert beside.flight_log_ratio == 0.0
+    c.add_log_ratios(agreeing(9.0))
+    c.neighbour_score = 10.0
+    for now in (agreeing(0.0, over_static=0.0), None):
+        c.add_log_ratios(now)
+        assert c.flight_log_ratio == 15.0
+    c.add_log_ratios(agreeing(9.0, over_static=DENIED - 1.0))
+    assert c.flight_log_ratio == 0.0
 
 
 # static, and reactivated

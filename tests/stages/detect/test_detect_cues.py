@@ -10,8 +10,17 @@ import pytest
 from stages.detect import EvidenceDetect
 from stages.messages import CueKind, CueState, DroneCue
 from tests.stages.caster import Ball, Drone, still
+from tests.stages.detect.shipped import detector
 from tests.stages.detect.test_candidate import candidate
-from tests.stages.detect.test_evidence_detect import MOVING, PLACE_M, accepted_after_s, observation, run
+from tests.stages.detect.test_evidence_detect import (
+    MOVING,
+    PLACE_M,
+    accepted_after_s,
+    observation,
+    predicted,
+    run,
+    telemetry_of,
+)
 from tests.stages.made import START_NS
 
 OFF_M = np.array([20.0, 0.0, 22.0])  # 30 m
@@ -32,13 +41,15 @@ def gnss(t_s: float, xyz_m) -> DroneCue:
 
 
 class Receiver:
-    """Publishes cues at 5 Hz, `off_m` from a trajectory, and keeps the states of the cue."""
+    """Publishes telemetry, and cues at 5 Hz, `off_m` from a trajectory, and keeps the states of the cue."""
 
-    def __init__(self, trajectory, off_m=(0.0, 0.0, 0.0)) -> None:
-        self._trajectory, self._off_m, self._next_s = trajectory, np.asarray(off_m), 0.0
+    def __init__(self, trajectory, off_m=(0.0, 0.0, 0.0), telemetry=telemetry_of(MOVING)) -> None:  # noqa: B008
+        self._trajectory, self._off_m, self._telemetry, self._next_s = trajectory, np.asarray(off_m), telemetry, 0.0
         self.states: list[CueState] = []
 
     def __call__(self, stage: EvidenceDetect, t_s: float) -> None:
+        if self._telemetry is not None:
+            self._telemetry(stage, t_s)
         if t_s >= self._next_s:
             self._next_s += 0.2
             xyz_m = self._trajectory(np.array([t_s - 0.2]))[0] + self._off_m
@@ -47,7 +58,7 @@ class Receiver:
 
 def test_a_cue_30_m_off_delays_the_drone_by_about_a_second_and_is_reported():
     receiver = Receiver(MOVING, OFF_M)
-    _, without = run([Drone(MOVING)])
+    _, without = run([Drone(MOVING)], publish=telemetry_of(MOVING))
     _, detections = run([Drone(MOVING)], seconds=4.0, publish=receiver)
     assert accepted_after_s(detections) < accepted_after_s(without) + 1.3
     assert not receiver.states[-1].trusted
@@ -71,7 +82,7 @@ def test_a_balloon_exactly_at_a_wrong_cue_is_not_accepted():
 
 
 def test_a_cue_that_matches_an_accepted_candidate_adds_nothing_to_another_one():
-    stage = EvidenceDetect(parked=True)
+    stage = detector(parked=True)
     now = stage._now
     drone, other = (candidate(observation(0.0, np.array(PLACE_M) + k)) for k in (0.0, 2.0))
     other.number = drone.number + 1
@@ -97,13 +108,13 @@ def test_after_the_drone_is_known_the_cues_bias_is():
 
 def classified(stage: EvidenceDetect, c, lidar_nats: float, monkeypatch):
     """The candidate, classified with these log-odds by the LiDAR."""
-    monkeypatch.setattr("stages.detect.evidence_detect.classify", lambda *_: (lidar_nats, "made"))
+    predicted(lidar_nats, monkeypatch)
     stage._classify(stage._now, c)
     return c
 
 
 def test_a_cue_does_not_keep_an_accepted_candidate_that_the_lidar_rejects(monkeypatch):
-    stage, c = EvidenceDetect(parked=True), candidate(observation(0.0, np.array(PLACE_M)))
+    stage, c = detector(parked=True), candidate(observation(0.0, np.array(PLACE_M)))
     c.scan_passes = 8
     stage.on_cue(gnss(0.2, PLACE_M))
     assert classified(stage, c, 3.5, monkeypatch).accepted
@@ -118,7 +129,7 @@ AT_REST_MPS = np.zeros(3)
 
 def observed(flies_mps, cue_flies_mps, off_m=(0.0, 0.0, 0.0), seconds=1.4):
     """A stage with a cue, and a candidate after these seconds, each with a constant velocity."""
-    stage, place_m = EvidenceDetect(parked=True), np.array(PLACE_M)
+    stage, place_m = detector(parked=True), np.array(PLACE_M)
     times_s = np.arange(0.0, seconds + 1e-9, 0.1)
     c = candidate(*(observation(t, place_m + t * flies_mps) for t in times_s))
     c.scan_passes = len(times_s)
@@ -156,7 +167,7 @@ def test_a_cue_that_does_not_show_that_it_is_of_a_candidate_never_has_it_accepte
 
 
 def test_a_cue_that_agreed_with_the_drone_has_one_accepted_that_hovers(monkeypatch):
-    stage, c = EvidenceDetect(parked=True), candidate(observation(0.0, np.array(PLACE_M)))
+    stage, c = detector(parked=True), candidate(observation(0.0, np.array(PLACE_M)))
     c.scan_passes = 8
     stage._now.table.put(c)
     classified(stage, c, 3.5, monkeypatch)
@@ -174,7 +185,7 @@ def proven(c):
 
 
 def test_what_limits_the_first_observations_does_not_limit_the_next(monkeypatch):
-    stage, c = EvidenceDetect(parked=True), proven(candidate(observation(0.0, np.array(PLACE_M))))
+    stage, c = detector(parked=True), proven(candidate(observation(0.0, np.array(PLACE_M))))
     stage.on_cue(gnss(0.2, PLACE_M))
     for passes in (1, 2):
         c.scan_passes = passes
@@ -184,7 +195,7 @@ def test_what_limits_the_first_observations_does_not_limit_the_next(monkeypatch)
 
 
 def test_a_gap_of_the_cue_is_no_contradiction(monkeypatch):
-    stage, c = EvidenceDetect(parked=True), proven(candidate(observation(0.0, np.array(PLACE_M))))
+    stage, c = detector(parked=True), proven(candidate(observation(0.0, np.array(PLACE_M))))
     c.scan_passes = 8
     stage.on_cue(gnss(0.2, PLACE_M))
     assert classified(stage, c, 1.0, monkeypatch).log_odds == pytest.approx(3.0)
@@ -195,7 +206,7 @@ def test_a_gap_of_the_cue_is_no_contradiction(monkeypatch):
 
 
 def test_a_jump_of_frame_map_removes_the_cues_of_the_old_one():
-    stage, c = EvidenceDetect(parked=True), candidate(observation(0.0, np.array(PLACE_M)))
+    stage, c = detector(parked=True), candidate(observation(0.0, np.array(PLACE_M)))
     c.scan_passes = 8
     stage.on_cue(gnss(0.2, PLACE_M))
     stage._now.odometry_jumped = True
@@ -205,7 +216,7 @@ def test_a_jump_of_frame_map_removes_the_cues_of_the_old_one():
 
 
 def test_a_cue_is_compared_only_with_what_the_lidar_alone_accepts(monkeypatch):
-    stage = EvidenceDetect(parked=True, cues={"max_gnss": 6.0, "max_sum": 6.0})
+    stage = detector(parked=True, cues={"max_gnss": 6.0, "max_sum": 6.0})
     c = proven(candidate(observation(0.0, np.array(PLACE_M))))
     c.scan_passes = 8
     stage._now.table.put(c)

@@ -1,28 +1,29 @@
-"""EvidenceDetect on synthetic skies: it accepts what hovers freely after a second of scan passes, and rejects the rest.
+"""EvidenceDetect on synthetic skies: it accepts a drone that moves as its telemetry, and rejects the rest.
 
-The skies are made by tests/stages/caster.py; nothing of them went into choosing the numbers of the evidence.
+The skies are made by tests/stages/caster.py; the shipped model was not trained on them.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
+import re
 from collections import Counter
 from itertools import pairwise
 
 import numpy as np
 import pytest
-import yaml
 from pydantic import ValidationError
 
 from flow.message import check_arrays
 from flow.stage import input_ports, output_ports
+from links.evaluation.stage_metrics import PROBABILITY_EDGES
 from stages.detect import EvidenceDetect
 from stages.detect.candidate import Alternative, Observation
 from stages.detect.candidate_messages import detections_message, log_odds_of
-from stages.detect.classifier import ClassifierWeights, over_clutter
 from stages.detect.evidence_detect import HYSTERESIS_NATS, NEAR_REJECTED_M, NEAR_REJECTED_NS, STATIC_NS
 from stages.detect.trained.features import NAMES, VERSION
+from stages.detect.trained.model import DetectorModel, Prediction
 from stages.geometry.frames import rotation_from_rpy_deg, rotation_z
 from stages.geometry.trajectory import VehicleTrajectory
 from stages.kernels.detect.isolation import FREE_0, SECTORS, TALLY
@@ -51,6 +52,7 @@ from tests.stages.caster import (
     sweeping,
     together,
 )
+from tests.stages.detect.shipped import detector, shipped_model
 from tests.stages.detect.test_candidate import candidate
 from tests.stages.made import ON_ITS_SIDE, START_NS
 
@@ -91,12 +93,12 @@ def drone_motion(t_s):
 
 
 def test_the_vehicles_motion_is_unknown_after_a_pause_of_its_odometry():
-    stage = EvidenceDetect()
+    stage = detector()
     assert not stage._motion_known(START_NS)
     stage.on_motion(motion_at(0.0))
     assert stage._motion_known(START_NS + 600_000_000)
     assert not stage._motion_known(START_NS + 800_000_000)
-    assert EvidenceDetect(parked=True)._motion_known(START_NS)
+    assert detector(parked=True)._motion_known(START_NS)
 
 
 def test_an_accepted_candidate_is_published_though_its_last_observation_precedes_the_interval():
@@ -137,14 +139,20 @@ def odometry(trajectory, t_s, R_odom_drone):
     )
 
 
-def run(
+def run(*args, **kwargs):
+    """(Candidates, Detections) of `all_messages`."""
+    messages = all_messages(*args, **kwargs)
+    return [m for m in messages if isinstance(m, Candidates)], [m for m in messages if isinstance(m, Detections)]
+
+
+def all_messages(
     things, seconds=3.0, servo_rad=WATCHING, drives_mps=(0.0, 0.0, 0.0), publish=None, stage=None, packets=1, **settings
 ):
-    """(Candidates, Detections) that the stage publishes.
+    """What the stage publishes.
 
     drives_mps None: no vehicle motion. publish(stage, t_s): publishes the drone's telemetry, each 20 ms.
     """
-    stage = stage or EvidenceDetect(**{"sweep_deg": PASS_DEG, **settings})
+    stage = stage or detector(**{"sweep_deg": PASS_DEG, **settings})
     messages, next_s = [], 0.0
     for pulses in together(pulses_seen(things, servo_rad, seconds), packets):
         while START_NS + next_s * 1e9 <= pulses.point_stamp_ns[-1]:
@@ -156,7 +164,12 @@ def run(
         messages += stage.on_pulses(pulses)
     for message in messages:
         check_arrays(message)
-    return [m for m in messages if isinstance(m, Candidates)], [m for m in messages if isinstance(m, Detections)]
+    return messages
+
+
+def feature(messages, name):
+    """A feature of all classified candidates (n,), in order of time; NaN: not available."""
+    return np.concatenate([m.features[:, NAMES.index(name)] for m in messages if isinstance(m, CandidateLog)])
 
 
 def telemetry_of(trajectory, until_s=math.inf, yaw_rad=0.9):
@@ -165,9 +178,18 @@ def telemetry_of(trajectory, until_s=math.inf, yaw_rad=0.9):
     )
 
 
+HOVERS = telemetry_of(still(*PLACE_M))
+LENIENT = {"publish": HOVERS, "accept_probability": 0.5}  # with it a hovering drone is accepted within a second
+
+
 def accepted_after_s(detections):
     """Time of the first accepted detection; inf: none."""
     return next(((d.stamp_ns - START_NS) * 1e-9 for d in detections if d.accepted.any()), math.inf)
+
+
+def most_probable(candidates):
+    """The highest probability of any candidate."""
+    return max((float(c.probability.max(initial=0.0)) for c in candidates), default=0.0)
 
 
 def reasons_of(candidates):
@@ -183,38 +205,49 @@ def test_ports_are_what_the_graph_wires():
 
 @pytest.mark.parametrize("seed", range(2))
 def test_a_small_moving_object_in_the_free_sky_is_accepted_within_seconds(seed):
-    candidates, detections = run([Drone(MOVING, seed=seed)])
-    assert 0.4 < accepted_after_s(detections) < 2.3
+    candidates, detections = run([Drone(MOVING, seed=seed)], publish=telemetry_of(MOVING))
+    assert 0.4 < accepted_after_s(detections) < 3.0
     last = detections[-1]
     assert last.accepted.tolist() == [True]
     evidence = last.evidence
     assert isinstance(evidence, CandidateEvidence)
-    assert evidence.probability[0] >= 0.98
+    assert most_probable(candidates) >= 0.95
     assert evidence.log_odds[0] == pytest.approx(math.log(evidence.probability[0] / (1 - evidence.probability[0])))
     truth = MOVING(np.array([(evidence.seen_ns[0] - START_NS) * 1e-9]))[0]
     np.testing.assert_allclose(last.xyz_vehicle_m[0], truth, atol=0.3)
     np.testing.assert_allclose(evidence.velocity_vehicle_mps[0], (0.8, 0.0, 0.4), atol=0.6)
     assert last.summary.startswith("drone at (")
     assert last.result is SearchResult.DRONE
-    assert candidates[-1].accept_probability == EvidenceDetect().settings.accept_probability
-    assert "sectors around it free" in last.reasons[0]
+    assert candidates[-1].accept_probability == detector().settings.accept_probability
+    assert re.search(r"moves as the drone's odometry, not as a balloon: .* \(\+", last.reasons[0])
     assert evidence.candidate_id[0] == candidates[0].candidate_id[0]  # the same object keeps its number
 
 
 @pytest.mark.parametrize("packets", [4, 8])
 def test_slices_of_several_packets_give_the_same_result_as_single_packets(packets):
     drives_mps = (5.0, 0.0, 0.0)  # and so does the drone
+    publish = telemetry_of(flying((-0.8, 8.0, 10.0), (5.8, 0.0, 0.4)))
     (candidates, one), (together, several) = (
-        run([Drone(MOVING)], drives_mps=drives_mps, packets=n) for n in (1, packets)
+        run([Drone(MOVING)], drives_mps=drives_mps, packets=n, publish=publish) for n in (1, packets)
     )
+    assert accepted_after_s(one) < 3.0
     assert accepted_after_s(several) == pytest.approx(accepted_after_s(one), abs=0.1)
     assert together[-1].scan_passes[0] == candidates[-1].scan_passes[0]
     assert together[-1].seen_ns[0] == pytest.approx(candidates[-1].seen_ns[0], abs=1e6)
     np.testing.assert_allclose(together[-1].xyz_vehicle_m[0], candidates[-1].xyz_vehicle_m[0], atol=0.03)
 
 
+def predicted(log_odds, monkeypatch):
+    """From now on the model gives these log-odds."""
+    monkeypatch.setattr(DetectorModel, "predict", lambda *_: Prediction(log_odds, 0, np.zeros(len(NAMES))))
+
+
+def test_the_evaluation_groups_probabilities_at_the_detectors_threshold():
+    assert PROBABILITY_EDGES[-2] == EvidenceDetect.settings_type.model_fields["accept_probability"].default
+
+
 def test_acceptance_has_a_hysteresis(monkeypatch):
-    stage, c = EvidenceDetect(), candidate(observation(0.0, np.array(PLACE_M)))
+    stage, c = detector(), candidate(observation(0.0, np.array(PLACE_M)))
     accept = log_odds_of(stage.settings.accept_probability)
     verdicts = []
     for log_odds in (
@@ -224,9 +257,7 @@ def test_acceptance_has_a_hysteresis(monkeypatch):
         accept - HYSTERESIS_NATS - 0.1,
         accept - 0.1,
     ):
-        monkeypatch.setattr(
-            "stages.detect.evidence_detect.classify", lambda *_, log_odds=log_odds: (log_odds, "so it is")
-        )
+        predicted(log_odds, monkeypatch)
         stage._classify(stage._now, c)
         verdicts.append(c.accepted)
     assert verdicts == [False, True, True, False, False]
@@ -235,79 +266,77 @@ def test_acceptance_has_a_hysteresis(monkeypatch):
 
 
 def test_the_probability_is_published_from_the_first_scan_passes_and_grows():
-    candidates, _ = run([Drone(MOVING)])
+    candidates, _ = run([Drone(MOVING)], publish=telemetry_of(MOVING))
     assert (candidates[0].stamp_ns - START_NS) * 1e-9 < 0.6
     probability = [float(c.probability[0]) for c in candidates]
-    assert probability[0] < 0.5 < 0.98 < probability[-1]
+    assert probability[0] < 0.5 < 0.95 < probability[-1]
     assert candidates[-1].scan_passes[0] > 15
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_hovering_drone_at_close_range_is_accepted_once_a_support_would_be_visible(seed):
-    candidates, detections = run([hovering(seed)], 4.2)
-    assert 1.0 < accepted_after_s(detections) < 3.0
-    assert "it may be static" in candidates[-1].reasons[0]
-    _, detections = run([hovering(seed)], 4.2, weights={"max_isolated_near": 0.0})
+    _, detections = run([hovering(seed)], 4.2, publish=HOVERS)
+    assert 1.0 < accepted_after_s(detections) < 4.0
+    _, detections = run([hovering(seed)], 4.2, publish=HOVERS, free_space=False)
     assert accepted_after_s(detections) == math.inf
 
 
 def test_candidates_name_the_detector_instance():
-    stage = EvidenceDetect(sweep_deg=PASS_DEG)
+    stage = detector(sweep_deg=PASS_DEG)
     whole, _ = run([hovering()], 1.5, stage=stage)
     assert {m.detector_instance for m in whole} == {START_NS}
     later = [p for p in pulses_seen([hovering()], WATCHING, 1.5) if p.stamp_ns > START_NS + 700_000_000]
-    afresh = EvidenceDetect(sweep_deg=PASS_DEG)
+    afresh = detector(sweep_deg=PASS_DEG)
     messages = [m for p in later for m in afresh.on_pulses(p) if isinstance(m, Candidates)]
     assert {m.detector_instance for m in messages} == {later[0].stamp_ns}
 
 
 def test_at_long_range_a_hovering_drone_stays_a_candidate_because_a_wire_is_invisible():
     far_m = 2.6 * np.array(PLACE_M)
-    candidates, detections = run([Drone(still(*far_m), span_m=0.9)], 4.2, span_m=0.9)
+    candidates, detections = run([Drone(still(*far_m), span_m=0.9)], 4.2, span_m=0.9, publish=HOVERS)
     assert accepted_after_s(detections) == math.inf
-    assert 0.5 < max(c.probability.max() for c in candidates if c.probability.size) < 0.95
+    assert 0.5 < most_probable(candidates) < 0.95
 
 
 SUPPORTS = {
-    "on a pole": (Wire((0.0, 8.0, 0.0), (0.0, 8.0, 9.9), 0.08), ("next to",)),
-    "nearby a wall": (Box((0.7, 6.0, 0.0), (1.2, 12.0, 14.0)), ("next to",)),
-    "on a wire": (Wire((-20.0, 8.0, 10.0), (20.0, 8.0, 10.0), 0.03), ("next to",)),
+    "on a pole": (Wire((0.0, 8.0, 0.0), (0.0, 8.0, 9.9), 0.08), "objects next to it"),
+    "nearby a wall": (Box((0.7, 6.0, 0.0), (1.2, 12.0, 14.0)), "a lamp, wire or edge"),
+    "on a wire": (Wire((-20.0, 8.0, 10.0), (20.0, 8.0, 10.0), 0.03), "short returns rejected at once"),
 }
 
 
 @pytest.mark.parametrize("where", SUPPORTS)
 def test_the_same_object_with_a_support_is_rejected_with_a_reason(where):
-    other, phrases = SUPPORTS[where]
-    candidates, detections = run([hovering(), other], 3.0)
+    other, phrase = SUPPORTS[where]
+    candidates, detections = run([hovering(), other], 3.0, **LENIENT)
     assert accepted_after_s(detections) == math.inf
     assert len(detections) >= 6
     remarks = reasons_of(candidates) + " | ".join(d.summary for d in detections)
-    assert all(phrase in remarks for phrase in phrases), remarks
+    assert phrase in remarks, remarks
     assert all(d.summary.startswith("no drone: ") for d in detections)
-    assert all(c.probability.size == 0 or c.probability.max() < 0.9 for c in candidates)
 
 
 def test_chords_hidden_by_a_nearer_object_are_counted():
     edge = Box((-3.0, 4.0, 0.0), (3.0, 4.1, 5.2))  # a nearer wall that covers its lower half
-    _, detections = run([Drone(still(*PLACE_M)), edge], 2.0)
+    _, detections = run([Drone(still(*PLACE_M)), edge], 2.0, **LENIENT)
     assert accepted_after_s(detections) == math.inf
     assert any("hidden at an end by something nearer" in d.summary for d in detections)
 
 
 def test_objects_far_behind_do_not_matter():
     wall = Box((-12.0, 16.0, 0.0), (12.0, 17.0, 30.0))
-    _, detections = run([Drone(MOVING), wall])
-    assert accepted_after_s(detections) < 2.3
+    _, detections = run([Drone(MOVING), wall], publish=telemetry_of(MOVING))
+    assert accepted_after_s(detections) < 3.0
 
 
 def test_a_wire_alone_is_never_a_drone():
-    _, detections = run([Wire((-20.0, 8.0, 10.0), (20.0, 8.0, 10.0), 0.02)], 3.0)
+    _, detections = run([Wire((-20.0, 8.0, 10.0), (20.0, 8.0, 10.0), 0.02)], 3.0, **LENIENT)
     assert accepted_after_s(detections) == math.inf
 
 
 def test_a_single_false_return_is_a_candidate_for_a_short_time_only():
     false_return = During(Ball(still(*PLACE_M), 0.02), 0.4, 0.6)
-    candidates, detections = run([false_return], 2.0)
+    candidates, detections = run([false_return], 2.0, **LENIENT)
     assert accepted_after_s(detections) == math.inf
     assert not candidates or candidates[-1].candidate_id.size == 0 or candidates[-1].probability.max() < 0.1
 
@@ -322,16 +351,18 @@ def test_rain_is_never_a_drone():
             n = len(t_s)
             return np.where(self.rng.random(n) < 0.0005, self.rng.uniform(2.0, 25.0, n), np.inf)
 
-    _, detections = run([Rain()], 3.0)
+    _, detections = run([Rain()], 3.0, **LENIENT)
     assert accepted_after_s(detections) == math.inf
 
 
 def test_a_smooth_ball_is_a_balloon_and_a_fast_object_a_bird():
-    balloon, refused = run([Ball(MOVING, 0.25)])
-    assert accepted_after_s(refused) == math.inf
-    assert "balloon" in reasons_of(balloon)
-    _, refused = run([Drone(flying((-15.0, 8.0, 10.0), (12.0, 0.0, 0.0)), span_m=0.4)])
-    assert accepted_after_s(refused) == math.inf
+    drone, _ = run([Drone(MOVING)])
+    balloon, _ = run([Ball(MOVING, 0.25)])
+    assert most_probable(balloon) < 0.5 * most_probable(drone)
+    assert "if not a drone: a balloon" in balloon[-1].reasons[0]
+    bird, _ = run([Drone(flying((-15.0, 8.0, 10.0), (12.0, 0.0, 0.0)), span_m=0.4)])
+    assert most_probable(bird) < 0.1 * most_probable(drone)
+    assert "if not a drone: a bird" in bird[-1].reasons[0]
 
 
 def test_each_pass_without_a_drone_publishes_empty_detections():
@@ -343,7 +374,8 @@ def test_each_pass_without_a_drone_publishes_empty_detections():
 
 def test_the_searched_intervals_are_contiguous():
     for things in ([], [hovering()]):
-        _, detections = run(things, 2.0)
+        _, detections = run(things, 2.0, **LENIENT)
+        assert math.isfinite(accepted_after_s(detections)) == bool(things)
         assert detections[0].evidence.start_ns == START_NS
         for before, after in pairwise(detections):
             assert before.evidence.start_ns < before.stamp_ns
@@ -352,7 +384,7 @@ def test_the_searched_intervals_are_contiguous():
 
 def test_a_sweep_over_houses_reports_the_number_of_rejected_objects():
     street = [Box((-9, -40, 0), (-7, 40, 9)), Box((7, -40, 0), (9, 40, 9)), Wire((7.5, 0, 0), (5.0, 0, 11), 0.1)]
-    _, detections = run(street, 3.3, servo_rad=sweeping(), sweep_deg=180.0)
+    _, detections = run(street, 3.3, servo_rad=sweeping(), sweep_deg=180.0, **LENIENT)
     assert accepted_after_s(detections) == math.inf
     ends_s = [(d.stamp_ns - START_NS) * 1e-9 for d in detections]
     assert ends_s == pytest.approx([1.475, 2.95], abs=0.02)  # 177 deg at 120 deg/s, each
@@ -362,15 +394,10 @@ def test_a_sweep_over_houses_reports_the_number_of_rejected_objects():
 # telemetry of the drone
 
 
-def test_a_drone_whose_path_agrees_with_its_odometry_is_accepted():
-    _, detections = run([Drone(MOVING)], publish=telemetry_of(MOVING))
-    assert 0.4 < accepted_after_s(detections) < 2.0
-    assert "its path agrees with the drone's odometry" in detections[-1].reasons[0]
-
-
 def test_the_yaw_of_the_odometrys_frame_does_not_matter():
     messages = [
-        run([Drone(MOVING)], 2.0, publish=telemetry_of(MOVING, yaw_rad=yaw)) for yaw in (0.0, math.pi / 2, 0.13)
+        run([Drone(MOVING)], 2.0, publish=telemetry_of(MOVING, yaw_rad=yaw), accept_probability=0.5)
+        for yaw in (0.0, math.pi / 2, 0.13)
     ]
     at_s = [accepted_after_s(detections) for _, detections in messages]
     assert at_s[1] == at_s[0] < 2.0
@@ -383,20 +410,18 @@ def test_the_odometry_is_used_for_any_attitude_of_the_drone(tilt_deg):
     R = rotation_from_rpy_deg(tilt_deg)
     by_position, _ = run([Drone(MOVING)], publish=telemetry_of(MOVING))
     by_odometry, detections = run([Drone(MOVING)], publish=lambda s, t: s.on_drone_odometry(odometry(MOVING, t, R)))
-    assert "its path agrees with the drone's odometry" in detections[-1].reasons[0]
+    assert accepted_after_s(detections) < 3.0
     for a, b in zip(by_position, by_odometry, strict=True):
         np.testing.assert_allclose(a.probability, b.probability, atol=1e-9)
         np.testing.assert_allclose(a.velocity_vehicle_mps, b.velocity_vehicle_mps, atol=1e-6)
 
 
 def test_an_object_that_passes_while_the_drone_hovers_is_a_bird():
-    glider = [Drone(GLIDING, span_m=0.5)]
-    _, silent = run(glider)
-    assert accepted_after_s(silent) < 2.5  # nothing else separates it from a drone
+    _, own = run([Drone(GLIDING, span_m=0.5)], publish=telemetry_of(GLIDING))
+    assert accepted_after_s(own) < 2.5  # nothing else separates it from a drone
     candidates, detections = run([Drone(GLIDING, span_m=0.5)], publish=telemetry_of(still(0.0, 0.0, 0.0)))
     assert accepted_after_s(detections) == math.inf
     assert candidates[-1].probability.max() < 0.05
-    assert "its path agrees with the drone's odometry" not in candidates[-1].reasons[0]
     assert "if not a drone: a bird" in candidates[-1].reasons[0]
 
 
@@ -409,8 +434,8 @@ PASSING_BY = flying((-3.0, 8.0, 10.0), (3.0, 0.0, 0.0))
 )
 def test_a_drone_reacquired_a_pass_later_keeps_its_evidence(publish, reacquired):
     shown = [During(Drone(PASSING_BY, seed=i), *when) for i, when in enumerate(SHOWN_S)]
-    candidates, _ = run(shown, seconds=2.0, publish=publish)
-    assert ("reacquired where the drone's odometry predicts it" in reasons_of(candidates)) == reacquired
+    messages = all_messages(shown, seconds=2.0, publish=publish)
+    assert np.isfinite(feature(messages, "passes_since_reacquired")).any() == reacquired
 
 
 def test_after_one_scan_pass_the_candidate_has_the_undirected_speed_of_the_telemetry():
@@ -428,9 +453,8 @@ def test_a_lamp_is_rejected_while_the_drone_flies_and_not_while_it_hovers():
     candidates, detections = run([hovering()], publish=flies)
     assert accepted_after_s(detections) == math.inf
     assert candidates[-1].candidate_id.size == 0 or candidates[-1].probability.max() < 0.02
-    candidates, detections = run([hovering()], publish=telemetry_of(still(0.0, 0.0, 0.0)))
-    assert accepted_after_s(detections) < 3.0
-    assert candidates[-1].probability.max() > 0.95
+    _, detections = run([hovering()], 4.2, publish=telemetry_of(still(0.0, 0.0, 0.0)))
+    assert accepted_after_s(detections) < 4.0
 
 
 def test_a_smooth_balloon_is_rejected_though_it_follows_the_odometry():
@@ -446,19 +470,21 @@ def test_observations_before_the_first_telemetry_do_not_disable_it():
         if t_s > 0.8:
             stage.on_drone_position(local_position(MOVING, t_s))
 
-    candidates, _ = run([Drone(MOVING)], publish=late)
-    assert "odometry" not in candidates[0].reasons[0]
-    assert "its path agrees with the drone's odometry" in candidates[-1].reasons[0]
+    over_bird = feature(all_messages([Drone(MOVING)], publish=late), "over_bird_nats")
+    assert np.isnan(over_bird[0])
+    assert over_bird[-1] > 3.0
 
 
 def test_after_telemetry_ends_its_evidence_so_far_remains():
-    spoke = run([Drone(MOVING)], publish=telemetry_of(MOVING, until_s=0.9))
-    silent = run([Drone(MOVING)])
-    assert "its path agrees with the drone's odometry" in spoke[1][-1].reasons[0]
-    assert "odometry" not in silent[1][-1].reasons[0]
-    np.testing.assert_array_equal(spoke[0][-1].velocity_vehicle_mps, silent[0][-1].velocity_vehicle_mps)
+    spoke, silent = (all_messages([Drone(MOVING)], publish=p) for p in (telemetry_of(MOVING, until_s=0.9), None))
+    assert feature(spoke, "over_bird_nats")[-1] > 1.0
+    assert np.isnan(feature(silent, "over_bird_nats")).all()
+    last = [[m.velocity_vehicle_mps for m in messages if isinstance(m, Candidates)][-1] for messages in (spoke, silent)]
+    np.testing.assert_array_equal(*last)
 
 
+AGREES = re.compile(r"moves as the drone's odometry, not as a \w+: .* \(\+")
+CONTRADICTS = re.compile(r"moves as the drone's odometry, not as a \w+: -\S+ \(-")
 FLIES_ON = flying((-2.4, 8.0, 10.0), (1.0, 0.0, 0.4))
 OTHERS = flying((0.0, 0.0, 0.0), (-3.0, 2.0, -0.8))
 
@@ -488,62 +514,56 @@ def switching(first, second, at_s):
 
 def test_telemetry_that_lies_mid_flight_makes_the_drone_improbable_within_seconds():
     true, lies = followed(telemetry_of(FLIES_ON)), followed(switching(FLIES_ON, OTHERS, 2.0))
-    assert all(p > 0.95 for t, p, _ in true if t > 2.0)
-    assert all(p > 0.95 for t, p, _ in lies if 1.5 < t < 2.0)
+    assert all(p > 0.95 for t, p, _ in true if t > 2.5)
+    assert all(p > 0.8 for t, p, _ in lies if 1.5 < t < 2.0)
     after = [(p, reason) for t, p, reason in lies if t > 4.0]
     assert after
-    assert all(p < 0.1 and "its path contradicts the drone's odometry" in reason for p, reason in after)
+    assert all(p < 0.1 and CONTRADICTS.search(reason) for p, reason in after)
 
 
 def test_telemetry_that_starts_mid_flight_counts_within_seconds():
     starts = followed(switching(None, FLIES_ON, 2.0))
-    assert not any("odometry" in reason for t, _, reason in starts if t < 2.0)
+    assert not any(AGREES.search(reason) for t, _, reason in starts if t < 2.0)
     after = [(p, reason) for t, p, reason in starts if t > 3.5]
     assert after
-    assert all("its path agrees with the drone's odometry" in reason for _, reason in after)
-    assert min(p for p, _ in after) > 0.95
-
-
-def test_the_trained_model_notices_telemetry_that_lies_mid_flight(request):
-    file = request.config.rootpath / "configs/models/detector.yaml"
-    model = yaml.safe_load(file.read_text())["stages"]["detect"]["config"]["model"]
-    lies = followed(switching(FLIES_ON, OTHERS, 2.0), model=model)
-    assert max(p for t, p, _ in lies if t < 2.0) > 0.9
-    after = [(p, reason) for t, p, reason in lies if t > 4.0]
-    assert all(p < 0.1 and "the drone's odometry" in reason for p, reason in after)
+    assert all(AGREES.search(reason) for _, reason in after)
+    assert min(p for p, _ in after) > 0.9
+    assert max(p for t, p, _ in starts if t < 2.0) < 0.7
 
 
 def test_telemetry_of_another_drone_that_starts_mid_flight_is_noticed_within_seconds():
     lies = followed(switching(None, OTHERS, 2.0))
     after = [(p, reason) for t, p, reason in lies if t > 4.0]
-    assert all(p < 0.1 and "contradicts" in reason for p, reason in after) or not after
+    assert all(p < 0.1 and CONTRADICTS.search(reason) for p, reason in after) or not after
 
 
 def test_after_telemetry_stops_mid_flight_the_drone_is_still_the_drone():
     stops = followed(switching(FLIES_ON, None, 1.0))
     after = [(p, reason) for t, p, reason in stops if t > 3.5]
     assert after
-    assert all(p > 0.95 and "agrees with the drone's odometry" in reason for p, reason in after)
+    assert all(p > 0.9 and AGREES.search(reason) for p, reason in after)
 
 
 def test_a_drone_first_seen_after_telemetry_stopped_is_weighed_by_its_path():
-    stage = EvidenceDetect(sweep_deg=PASS_DEG)
+    stage = detector(sweep_deg=PASS_DEG)
     for k in range(50):
         stage.on_drone_position(local_position(FLIES_ON, 0.02 * k - 3.0))
-    candidates, _ = run([Drone(FLIES_ON)], 3.0, stage=stage)
-    assert candidates[-1].candidate_id.size
-    assert not any("odometry" in reason for m in candidates for reason in m.reasons)
+    messages = all_messages([Drone(FLIES_ON)], 3.0, stage=stage)
+    assert feature(messages, "scan_passes")[-1] > 8.0
+    assert np.isnan(feature(messages, "over_bird_nats")).all()
 
 
 def test_without_vehicle_motion_only_heights_are_compared():
     rising = flying((0.0, 0.0, 0.0), (0.0, 0.0, 1.5))
     passes_and_rises = Drone(flying((-2.0, 8.0, 8.0), (1.5, 0.0, 1.5)))
-    log_ratios, _ = run([passes_and_rises], 2.5, drives_mps=None, publish=telemetry_of(rising))
-    assert "its path agrees with the drone's odometry" in log_ratios[-1].reasons[0]
-    pass_throughs = Drone(flying((-2.0, 8.0, 10.0), (1.5, 0.0, 0.0)))
-    log_ratios, detections = run([pass_throughs], 2.5, drives_mps=None, publish=telemetry_of(rising))
+    settings = {"drives_mps": None, "publish": telemetry_of(rising), "accept_probability": 0.5}
+    candidates, detections = run([passes_and_rises], 2.5, **settings)
+    assert accepted_after_s(detections) < 1.0
+    assert AGREES.search(candidates[-1].reasons[0])
+    stays_level = Drone(flying((-2.0, 8.0, 10.0), (1.5, 0.0, 0.0)))
+    candidates, detections = run([stays_level], 2.5, **settings)
     assert accepted_after_s(detections) == math.inf
-    assert log_ratios[-1].probability.max(initial=0.0) < 0.1
+    assert candidates[-1].probability.max(initial=0.0) < 0.1
 
 
 def test_a_candidate_observed_twice_has_the_speed_of_the_telemetry():
@@ -564,31 +584,30 @@ def looking_away(from_s, to_s):
 
 
 def test_a_static_object_is_reactivated():
-    stage = EvidenceDetect(sweep_deg=PASS_DEG, forget_s=0.5, weights=ClassifierWeights(max_isolated_near=0.0))
-    candidates, detections = run([hovering()], 4.5, looking_away(1.5, 3.0), stage=stage)
+    stage = detector(sweep_deg=PASS_DEG, forget_s=0.5)
+    candidates, _ = run([hovering()], 4.5, looking_away(1.5, 3.0), stage=stage)
     numbers = {int(number) for messages in candidates for number in messages.candidate_id}
     assert numbers == {1}
     messages = [c for c in candidates if c.candidate_id.size]
     before = max(c.scan_passes[0] for c in messages if c.stamp_ns < START_NS + 2e9)
     again = next(c for c in messages if c.stamp_ns > START_NS + 2.9e9)
     assert again.scan_passes[0] > before > 5
-    assert accepted_after_s(detections) == math.inf
     assert len(stage._now.static) == 0  # it is a candidate again
 
 
 def test_static_objects_need_vehicle_motion_and_moving_ones_are_not_remembered():
-    stage = EvidenceDetect(sweep_deg=PASS_DEG, forget_s=0.5)
+    stage = detector(sweep_deg=PASS_DEG, forget_s=0.5)
     run([hovering()], 2.5, looking_away(1.5, 9.0), drives_mps=None, stage=stage)
     assert list(stage._now.table) == []
     assert len(stage._now.static) == 0
-    stage = EvidenceDetect(sweep_deg=PASS_DEG, forget_s=0.5)
+    stage = detector(sweep_deg=PASS_DEG, forget_s=0.5)
     run([Drone(MOVING)], 2.5, looking_away(1.5, 9.0), stage=stage)
     assert list(stage._now.table) == []
     assert len(stage._now.static) == 0
 
 
 def test_static_objects_are_forgotten_after_a_minute():
-    stage = EvidenceDetect(sweep_deg=PASS_DEG, forget_s=0.5, parked=True)
+    stage = detector(sweep_deg=PASS_DEG, forget_s=0.5, parked=True)
     run([hovering()], 2.5, looking_away(1.5, 9.0), stage=stage)
     assert [c.number for c in stage._now.static] == [1]
     seen_ns = stage._now.static[0].seen_ns
@@ -615,25 +634,20 @@ def observation(t_s, xyz_m, free_sectors=SECTORS, returns=1):
     )
 
 
-def near_a_rejected(away_m, after_s, parked=True, returns=1):
-    """The candidate that appears next to an object that was rejected for lack of free space."""
-    stage = EvidenceDetect(parked=parked)
-    stage._associate(stage._now, observation(1.0, (0.0, 20.0, 20.0), free_sectors=0, returns=returns))
+def near_a_rejected(away_m, after_s, parked=True):
+    """The candidate that appears next to an object that was rejected as a part of a large one."""
+    stage = detector(parked=parked)
+    part = observation(1.0, (0.0, 20.0, 20.0), free_sectors=0)
+    stage._associate(stage._now, dataclasses.replace(part, large_object_m=1.0))
     assert list(stage._now.table) == []
     stage._associate(stage._now, observation(1.0 + after_s, (away_m, 20.0, 20.0), returns=3))
-    (candidate,) = stage._now.table
-    return candidate
+    return stage._now.classified[2]
 
 
 def test_near_a_recently_rejected_object_a_static_candidate_is_less_probable():
     nearby, distant = near_a_rejected(1.0, 5.0), near_a_rejected(NEAR_REJECTED_M + 1.0, 5.0)
-    assert "an object near it was rejected" in nearby.reason
-    assert "an object near it was rejected" not in distant.reason
+    assert [c.features[NAMES.index("near_rejected")] for c in (nearby, distant)] == [1.0, 0.0]
     assert nearby.log_odds < distant.log_odds
-    (less, *_), (more, *_) = (over_clutter(c, ClassifierWeights(), True, True) for c in (nearby, distant))
-    assert more - less == pytest.approx(
-        ClassifierWeights().near_rejected, abs=0.01
-    )  # at 1 m distance from it the range differs slightly
 
 
 @pytest.mark.parametrize(
@@ -644,24 +658,26 @@ def test_a_rejected_position_is_forgotten_sooner_without_vehicle_motion(parked, 
     assert not near_a_rejected(1.0, memory_s + 0.1, parked).near_rejected
 
 
-def test_rain_leaves_no_rejected_position():
-    stage = EvidenceDetect(parked=True)
-    stage._associate(
-        stage._now, observation(1.0, (0.0, 45.0, 45.0), free_sectors=SECTORS)
-    )  # free all around, once, at long range
+@pytest.mark.parametrize("alternative", Alternative)
+def test_only_static_objects_leave_a_rejected_position(alternative):
+    """Rain, a bird or a balloon does not."""
+    priors = [(-9.0, -9.0) if one is alternative else (9.0, 9.0) for one in Alternative]
+    stage = detector(parked=True, model={"feature_version": VERSION, "priors": priors, "terms": [TERM]})
+    stage._associate(stage._now, observation(1.0, (0.0, 45.0, 45.0)))
     assert list(stage._now.table) == []
-    assert dict(stage._now.rejected) == {"a false return": 1}
-    assert stage._now.rejected_map.nearest_m(np.array([0.0, 45.0, 45.0]), 0.0, NEAR_REJECTED_M, START_NS) == math.inf
+    assert dict(stage._now.rejected) == {alternative.value: 1}
+    nearest_m = stage._now.rejected_map.nearest_m(np.array([0.0, 45.0, 45.0]), 0.0, NEAR_REJECTED_M, START_NS)
+    assert math.isfinite(nearest_m) == (alternative is Alternative.STATIC)
 
 
 @pytest.mark.parametrize("messages", [True, False])
 def test_from_a_driving_vehicle_static_objects_need_its_odometry(messages):
     drives = (1.5, 0.0, 0.0)
     lamp = Ball(flying((2.0, 8.0, 10.0), (-1.5, 0.0, 0.0)), 0.2)  # static in frame map
-    candidates, detections = run([lamp], 2.0, drives_mps=drives if messages else None)
-    assert accepted_after_s(detections) == math.inf
-    if messages:
-        assert "it may be static" in candidates[-1].reasons[0]
+    found = all_messages([lamp], 2.0, drives_mps=drives if messages else None, accept_probability=0.5)
+    assert accepted_after_s([m for m in found if isinstance(m, Detections)]) == math.inf
+    assert not feature(found, "moves").any()
+    assert (feature(found, "straight_mps")[-1] < 0.3) == messages
 
 
 def jumping(at_s, by_m, silent_until_s=0.0):
@@ -677,19 +693,22 @@ def jumping(at_s, by_m, silent_until_s=0.0):
 
 @pytest.mark.parametrize("by_m", [(1.2, 0.5, 0.0), (300.0, -40.0, 0.0)])
 def test_a_jump_of_the_vehicles_odometry_keeps_candidates_and_static_objects(by_m):
-    candidates, detections = run(
-        [hovering()], 3.0, drives_mps=None, publish=jumping(1.0, by_m), weights=ClassifierWeights(max_isolated_near=0.0)
-    )
-    assert {int(number) for messages in candidates for number in messages.candidate_id} == {1}
-    assert accepted_after_s(detections) == math.inf
-    assert "it may be static" in candidates[-1].reasons[0]
+    messages = all_messages([hovering()], 3.0, drives_mps=None, publish=jumping(1.0, by_m))
+    candidates = [m for m in messages if isinstance(m, Candidates)]
+    assert {int(number) for message in candidates for number in message.candidate_id} == {1}
+    assert not feature(messages, "moves").any()
     assert candidates[-1].scan_passes[0] > 12
-    _, detections = run([Drone(MOVING)], 4.0, drives_mps=None, publish=jumping(1.0, by_m))
+
+    def publish(stage, t_s):
+        jumping(1.0, by_m)(stage, t_s)
+        telemetry_of(MOVING)(stage, t_s)
+
+    _, detections = run([Drone(MOVING)], 4.0, drives_mps=None, publish=publish)
     assert accepted_after_s(detections) < 3.0
 
 
 def test_a_jump_during_a_gap_of_the_odometry_resets_the_memory():
-    stage = EvidenceDetect(sweep_deg=PASS_DEG, forget_s=0.5)
+    stage = detector(sweep_deg=PASS_DEG, forget_s=0.5)
     run(
         [hovering()],
         4.0,
@@ -699,7 +718,7 @@ def test_a_jump_during_a_gap_of_the_odometry_resets_the_memory():
         stage=stage,
     )
     assert len(stage._now.static) == len(list(stage._now.table)) == 0
-    stage = EvidenceDetect(sweep_deg=PASS_DEG, forget_s=0.5)
+    stage = detector(sweep_deg=PASS_DEG, forget_s=0.5)
     run(
         [hovering()],
         4.0,
@@ -713,16 +732,11 @@ def test_a_jump_during_a_gap_of_the_odometry_resets_the_memory():
 
 def test_a_candidate_without_observations_is_removed():
     gone = During(hovering(), 0.0, 2.0)
-    stage = EvidenceDetect(sweep_deg=PASS_DEG, forget_s=0.5)
+    stage = detector(sweep_deg=PASS_DEG, forget_s=0.5)
     for pulses in pulses_seen([gone], WATCHING, 4.0):
         list(stage.on_pulses(pulses))
     assert list(stage._now.table) == []
     assert stage._now.watches == {}
-
-
-def test_without_free_space_the_reasons_do_not_mention_sectors():
-    candidates, _ = run([hovering()], 2.0, free_space=False)
-    assert "sectors" not in reasons_of(candidates)
 
 
 def test_the_same_pulses_give_the_same_messages():
@@ -736,7 +750,7 @@ def test_the_same_pulses_give_the_same_messages():
         np.testing.assert_array_equal(a.xyz_vehicle_m, b.xyz_vehicle_m)
 
 
-def test_a_trained_model_replaces_the_classifier():
+def test_the_model_decides():
     model = {"feature_version": VERSION, "priors": [(9.0, 9.0)] * 4, "terms": [TERM]}
     _, accepted = run([hovering()], 1.5, model=model)
     assert accepted_after_s(accepted) < 1.0
@@ -749,7 +763,7 @@ def test_a_trained_model_replaces_the_classifier():
 def test_without_free_space_the_model_has_no_feature_of_the_surroundings():
     model = {"feature_version": VERSION, "priors": [(0.0, 0.0)] * 4, "terms": [TERM | {"feature": "free_sectors"}]}
     for free_space in (True, False):
-        stage, logged = EvidenceDetect(model=model, free_space=free_space), []
+        stage, logged = detector(model=model, free_space=free_space), []
         for pulses in pulses_seen([hovering()], WATCHING, 0.5):
             logged += [m for m in stage.on_pulses(pulses) if isinstance(m, CandidateLog)]
         known = ~np.isnan(np.concatenate([m.features[:, NAMES.index("free_sectors")] for m in logged]))
@@ -757,7 +771,7 @@ def test_without_free_space_the_model_has_no_feature_of_the_surroundings():
 
 
 def test_the_imu_is_compared_with_a_candidate_without_the_autopilots_estimate():
-    stage, logged = EvidenceDetect(parked=True), []
+    stage, logged = detector(parked=True), []
     for k in range(1, 100):
         stage.on_drone_motion(drone_motion(0.02 * k))
     for pulses in pulses_seen([Drone(GLIDING)], WATCHING, 2.5):
@@ -768,7 +782,7 @@ def test_the_imu_is_compared_with_a_candidate_without_the_autopilots_estimate():
 
 
 def test_the_imu_is_no_evidence_while_the_odometry_made_with_it_is():
-    stage, logged = EvidenceDetect(parked=True), []
+    stage, logged = detector(parked=True), []
     for k in range(1, 250):
         stage.on_drone_motion(drone_motion(0.02 * k))
     for pulses in pulses_seen([Drone(MOVING)], WATCHING, 4.5):
@@ -791,7 +805,7 @@ def test_the_imu_is_no_evidence_while_the_odometry_made_with_it_is():
 
 
 def test_every_classified_candidate_is_logged_with_its_features():
-    stage, logged = EvidenceDetect(sweep_deg=PASS_DEG), []
+    stage, logged = detector(sweep_deg=PASS_DEG), []
     for pulses in pulses_seen([Drone(MOVING)], WATCHING, 1.5):
         logged += [m for m in stage.on_pulses(pulses) if isinstance(m, CandidateLog)]
     for message in logged:
@@ -811,7 +825,7 @@ def test_a_slice_without_pulses_is_ignored():
     (pulses,) = list(pulses_seen([], WATCHING, 0.0014, mount=ON_ITS_SIDE))[:1]
     for name in ("point_stamp_ns", "direction_vehicle", "range_m", "laser", "reflectivity"):
         object.__setattr__(pulses, name, getattr(pulses, name)[:0])
-    assert list(EvidenceDetect().on_pulses(pulses)) == []
+    assert list(detector().on_pulses(pulses)) == []
 
 
 @pytest.mark.parametrize(
@@ -819,19 +833,20 @@ def test_a_slice_without_pulses_is_ignored():
     [
         {"span_m": 0.0},
         {"accept_probability": 1.0},
+        {"accept_probability": 0.49},
         {"follow_up_probability": 0.6},
         {"report_s": 0.0},
-        {"weights": {"luck": 1}},
     ],
 )
 def test_impossible_settings_are_rejected(settings):
     with pytest.raises(ValidationError):
-        EvidenceDetect(**settings)
+        detector(**settings)
 
 
 @pytest.mark.parametrize(
     ("model", "text"),
     [
+        (None, "include models/detector.yaml"),
         ({}, "feature_version"),
         ({"feature_version": VERSION, "priors": [(1.0, 1.0)] * 4, "terms": []}, "terms"),
         ({"feature_version": VERSION - 1, "priors": [(1.0, 1.0)] * 4, "terms": [TERM]}, "train it again"),
@@ -840,21 +855,27 @@ def test_impossible_settings_are_rejected(settings):
 )
 def test_a_model_that_was_not_trained_or_for_other_features_is_refused(model, text):
     with pytest.raises(ValidationError, match=text):
-        EvidenceDetect(model=model)
+        detector(model=model)
 
 
-def test_a_rejected_lamp_is_not_published_again_while_the_drone_flies():
+def test_a_rejected_lamp_is_not_published_again():
     """It is observed in each pass; another observation takes time from the drone."""
 
-    def published(trajectory, reacquired):
-        stage = EvidenceDetect(sweep_deg=PASS_DEG, weights=ClassifierWeights(revisited=reacquired))
+    def found(trajectory, left_out=()):
+        terms = tuple(term for term in shipped_model().terms if term.feature not in left_out)
+        stage = detector(sweep_deg=PASS_DEG, model=dict(shipped_model()) | {"terms": terms})
         stage._now.rejected_map.add(np.array([PLACE_M]), START_NS)
-        candidates, _ = run([hovering()], 0.5, publish=telemetry_of(trajectory), stage=stage)
-        return sum(c.candidate_id.size > 0 for c in candidates)
+        messages = all_messages([hovering()], 1.0, publish=telemetry_of(trajectory), stage=stage)
+        published = any(m.candidate_id.size for m in messages if isinstance(m, Candidates))
+        probability = next(m.probability[0] for m in messages if isinstance(m, CandidateLog))
+        return published, feature(messages, "revisited")[0], probability
 
-    flies = flying((0.0, 0.0, 0.0), (3.0, 0.0, 0.0))
-    assert published(flies, 4.0) == 0 < published(flies, 0.0)
-    assert published(still(0.0, 0.0, 0.0), 4.0) > 0
+    flies, hovers = flying((0.0, 0.0, 0.0), (3.0, 0.0, 0.0)), still(0.0, 0.0, 0.0)
+    assert found(flies, ("near_rejected", "revisited"))[0]
+    (published, revisited, probability), while_it_hovers = found(flies), found(hovers)
+    assert not published
+    assert (revisited, while_it_hovers[1]) == (1.0, 0.0)
+    assert probability < while_it_hovers[2]
 
 
 @pytest.mark.parametrize(("step_m", "remembered"), [(0.0, True), (0.5, False)])
@@ -863,7 +884,7 @@ def test_only_static_candidates_are_remembered_as_rejected_objects(step_m, remem
     path = [observation(0.1 * k, (step_m * k, 20.0, 20.0)) for k in range(6)]
     c = candidate(*path)
     c.alternative = Alternative.STATIC
-    stage = EvidenceDetect(parked=True)
+    stage = detector(parked=True)
     stage._remember_rejected(stage._now, c)
     nearest_m = stage._now.rejected_map.nearest_m(c.xyz_m, 0.0, NEAR_REJECTED_M, START_NS)
     assert math.isfinite(nearest_m) == remembered

@@ -108,6 +108,16 @@ def test_repeated_observations_raise_the_existence_and_distant_ones_do_not():
     assert named(repeated)["existence_nats"] > named(scattered)["existence_nats"] + 5
 
 
+@pytest.mark.parametrize(
+    ("range_m", "returns", "nats"), [(11.0, 12, 7.0), (25.0, 12, 9.0), (25.0, 1, 7.0), (45.0, 1, 9.0)]
+)
+def test_where_a_wire_returns_pulses_a_path_along_one_is_no_flight(range_m, returns, nats):
+    """Several in a scan pass to 20 m, single ones to 30 m; beyond, telemetry is compared with a static object."""
+    c = candidate(*(observation(0.1 * k, returns=returns, range_m=range_m) for k in range(12)))
+    c.log_ratios = MotionLogRatios(9.0, 4.0, 3.0, 7.0, misfit=1.1, displacement_m=9.0)
+    assert named(c)["displaced_nats"] == nats
+
+
 def test_far_away_a_lamp_may_seem_to_move_as_far_as_a_drone():
     near, far = (candidate(observation(0.0, range_m=r), observation(0.1, range_m=r)) for r in (15.0, 32.0))
     for c in (near, far):

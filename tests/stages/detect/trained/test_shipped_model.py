@@ -6,10 +6,9 @@ import math
 
 import numpy as np
 import pytest
-import yaml
 
 from tests.stages.caster import Ball, Drone, Wire, flying, still
-from tests.stages.detect.test_evidence_detect import PASS_DEG, accepted_after_s, run, telemetry_of
+from tests.stages.detect.test_evidence_detect import accepted_after_s, run, telemetry_of
 
 PLACE_M = np.array([0.0, 8.0, 10.0])
 OBJECTS = {
@@ -28,27 +27,20 @@ def wandering(phase):
     return lambda t_s: PLACE_M + amplitude_m * np.sin(np.outer(t_s, radps) + phase * np.array([1.0, 2.0, 3.0]))
 
 
-@pytest.fixture(scope="module")
-def shipped(request):
-    file = request.config.rootpath / "configs/models/detector.yaml"
-    return yaml.safe_load(file.read_text())["stages"]["detect"]["config"]["model"]
-
-
 @pytest.mark.parametrize("span_m", [0.4, 0.7])
 @pytest.mark.parametrize(
     "trajectory",
     [wandering(0.0), wandering(1.7), flying((-1.0, 8.0, 9.0), (0.2, 0.0, 1.0)), flying((-7.0, 8.0, 10.0), (4.0, 0.0, 0.2))],
     ids=["wanders", "wanders otherwise", "climbs", "passes"],
 )  # fmt: skip
-def test_a_drone_with_telemetry_is_accepted(shipped, trajectory, span_m):
-    publish = telemetry_of(trajectory)
-    _, detections = run([Drone(trajectory, span_m)], 4.0, publish=publish, sweep_deg=PASS_DEG, model=shipped)
+def test_a_drone_with_telemetry_is_accepted(trajectory, span_m):
+    _, detections = run([Drone(trajectory, span_m)], 4.0, publish=telemetry_of(trajectory))
     assert accepted_after_s(detections) < 4.0
 
 
-def test_a_drone_that_hovers_as_its_telemetry_says_is_probable(shipped):
+def test_a_drone_that_hovers_as_its_telemetry_says_is_probable():
     hovers = still(*PLACE_M)
-    candidates, _ = run([Drone(hovers)], 4.0, publish=telemetry_of(hovers), sweep_deg=PASS_DEG, model=shipped)
+    candidates, _ = run([Drone(hovers)], 4.0, publish=telemetry_of(hovers))
     assert max(m.probability.max() for m in candidates if len(m.probability)) > 0.7
 
 
@@ -56,7 +48,7 @@ def test_a_drone_that_hovers_as_its_telemetry_says_is_probable(shipped):
     "publish", [None, telemetry_of(wandering(0.0))], ids=["no telemetry", "the drone is elsewhere"]
 )
 @pytest.mark.parametrize("name", OBJECTS)
-def test_no_other_object_is_accepted(shipped, name, publish):
-    candidates, detections = run(OBJECTS[name], 4.0, publish=publish, sweep_deg=PASS_DEG, model=shipped)
+def test_no_other_object_is_accepted(name, publish):
+    candidates, detections = run(OBJECTS[name], 4.0, publish=publish)
     assert any(len(m.probability) for m in candidates)  # it was weighed
     assert accepted_after_s(detections) == math.inf

@@ -73,6 +73,7 @@ class Candidate:
     p: tuple[float, float, float]  # variances: position, position-velocity, velocity
     first_returns: int
     scan_passes: int = 1  # passes of the rotor in which it was observed
+    first_ns: int = 0  # of its first observation; of a reacquired one, since it was reacquired
     existence_nats: float = 0.0  # log-odds that one object causes its observations, see trained/existence.py
     false_per_s: float = LEAST_FALSE_PER_S  # rate of false returns at its range, at its last observation
     observations: int = 0
@@ -92,8 +93,9 @@ class Candidate:
     large_object_passes: int = 0
     large_object_m: float = math.inf
     seen_ns: int = 0
-    log_odds: float = 0.0  # newest result of the model, cues included
-    own_log_odds: float = 0.0  # without cues
+    own_log_odds: float = 0.0  # newest result of the model, as if it were the only candidate
+    single_log_odds: float = 0.0  # with cues
+    log_odds: float = 0.0  # with cues and with the other candidates, of which one at most is the drone
     cue_nats: float | None = None  # what cues add to it; None: no cue yet
     cue_ns: int = 0  # when that was computed
     proven_cues: set[str] = field(default_factory=set[str])  # sources of the cues that are proven to be of it

@@ -7,6 +7,7 @@ Source: ours.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 
 import numpy as np
@@ -71,6 +72,15 @@ class CandidateTable:
         found = nearest_rows(self._state, self._ns, self._reacquired, rows, s.stamp_ns, s.xyz_map_m)
         reacquired, other = (self._candidates[row] if row >= 0 else None for row in found)
         return reacquired, other
+
+    def rivals_of(self, c: Candidate, apart_m: float) -> Iterator[Candidate]:
+        """The promising candidates that are another object: observed in alternation with `c`, `apart_m` away."""
+        for row in np.flatnonzero(self._promising[: len(self._candidates)]).tolist():
+            other = self._candidates[row]
+            if other.seen_ns >= c.first_ns and c.seen_ns >= other.first_ns and other.number != c.number:
+                now_m = other.xyz_m + (c.stamp_ns - other.stamp_ns) * 1e-9 * other.velocity_mps
+                if math.dist(now_m, c.xyz_m) > apart_m:
+                    yield other
 
     def pass_throughs_of(
         self, part: Slice, origin_m: Array64, disc_m: float, most_variance: float

@@ -4,10 +4,11 @@
            -> observations (observations.py): one scan pass on one object, and its surroundings (isolation.py)
            -> candidates (candidate.py): observations that fit one moving object (flight.py)
            -> log-odds of a drone over a false return, a static object, a bird and a balloon (trained/model.py)
+           -> P = o / (1 + sum of the odds o of all candidates): one of them at most is the drone
 
-A scan pass is one passing of the rotor; they are 0.1 s apart. A candidate is accepted at `accept_probability`. A
-candidate above `follow_up_probability` is promising and published at once (Candidates), so that the aim can observe it
-again. Detections are published when a candidate is accepted, at the end of each pass of the turntable, and at least
+A scan pass is one passing of the rotor; they are 0.1 s apart. A candidate is accepted at `accept_probability`. One that
+by itself is above `follow_up_probability` is promising and published at once (Candidates), so that the aim can observe
+it again. Detections are published when a candidate is accepted, at the end of each pass of the turntable, and at least
 every `report_s` while there is a drone.
 
 Source: ours, for P III.B; DESIGN, The graph: detect.
@@ -36,7 +37,7 @@ from stages.detect.reacquire import reacquired_candidate, without_duplicates
 from stages.detect.telemetry import DetectorTelemetry
 from stages.detect.trained.existence import FalseReturns, birth_nats, passed_nats
 from stages.detect.trained.features import FREE_SPACE, features_of
-from stages.detect.trained.model import ALTERNATIVES, DetectorModel, reasons_of
+from stages.detect.trained.model import ALTERNATIVES, LEAST_NATS, DetectorModel, reasons_of
 from stages.geometry.frames import Array64
 from stages.geometry.rig_lidar import RigLidar
 from stages.geometry.trajectory import VehicleTrajectory
@@ -55,6 +56,7 @@ from stages.messages import (
     SweptPulses,
     VehicleMotion,
 )
+from stages.sums import sum_in_order
 from stages.sweep.sweep import Travel
 
 PRUNE_PERIOD_NS = 84_300_000  # about twelve times a second
@@ -242,6 +244,7 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
             range_m=s.range_m,
             p=(SIGMA_M**2, 0.0, START_SPEED_MPS**2),
             first_returns=s.returns,
+            first_ns=s.stamp_ns,
             false_per_s=now.false_returns.per_s(s.range_m, s.stamp_ns),
         )
         new.existence_nats = birth_nats(new.false_per_s)
@@ -300,16 +303,26 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
             c.features[list(FREE_SPACE)] = math.nan
         prediction = settings.model.predict(c.features)
         c.alternative = ALTERNATIVES[prediction.alternative]
-        c.log_odds = c.own_log_odds = prediction.log_odds
+        c.single_log_odds = c.own_log_odds = prediction.log_odds
         remark = self._add_cues(now, c)
+        others_nats = self._others_nats(now, c)
+        c.log_odds = c.single_log_odds - others_nats
+        if others_nats >= LEAST_NATS:
+            remark += f"; other candidates {-others_nats:+.1f}"
         now.classified[c.number] = c
         accept = self._accept_nats
-        c.accepted = c.log_odds >= accept or (c.accepted and c.own_log_odds >= accept - HYSTERESIS_NATS)
-        before, c.is_promising = c.is_promising, c.log_odds >= self._follow_up_nats
+        kept = c.accepted and c.own_log_odds - others_nats >= accept - HYSTERESIS_NATS
+        c.accepted = c.log_odds >= accept or kept
+        before, c.is_promising = c.is_promising, c.single_log_odds >= self._follow_up_nats
         c.was_promising |= c.is_promising
         named = c.is_promising or c.observations > 1  # others are rejected at once
         c.reason = (reasons_of(c.features, prediction) if named else "") + remark
         return c.was_promising or before != c.is_promising
+
+    def _others_nats(self, now: _State, c: Candidate) -> float:
+        """What other candidates take from the log-odds: one at most is the drone, P = o / (1 + sum of all odds o)."""
+        rivals = now.table.rivals_of(c, self.settings.clear_m)
+        return math.log1p(sum_in_order([math.exp(other.single_log_odds) for other in rivals]))
 
     def _add_cues(self, now: _State, c: Candidate) -> str:
         """Add the evidence of cues to the log-odds: their lowest of the last seconds, so that a short match is none.
@@ -332,13 +345,14 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
             since_s = (c.stamp_ns - c.cue_ns) * 1e-9
             nats = min(nats, c.cue_nats + self.settings.cues.recovery_nats_per_s * since_s)
         c.cue_nats, c.cue_ns = nats, c.stamp_ns
-        ceiling = max(self._accept_nats - CUE_MARGIN_NATS - c.log_odds, 0.0)
+        ceiling = max(self._accept_nats - CUE_MARGIN_NATS - c.single_log_odds, 0.0)
         if nats > max(of_proven, ceiling) and c.scan_passes >= CUE_PASSES:
             c.proven_cues |= now.cues.proven(ObjectPath(c.path_ns, c.path_m, scatter_m(c.range_m)), now.trail)
             of_proven = now.cues.nats(state, now.trail, c.stamp_ns, c.proven_cues).of_proven
         nats = min(nats, max(of_proven, ceiling) if c.scan_passes >= CUE_PASSES else ceiling)
-        observed = min(c.log_odds, self._follow_up_nats)
-        c.log_odds = max(c.log_odds + nats, observed)  # a wrong cue does not end the observation of the drone
+        observed = min(c.single_log_odds, self._follow_up_nats)
+        # a wrong cue does not end the observation of the drone
+        c.single_log_odds = max(c.single_log_odds + nats, observed)
         return f"; cues {nats:+.1f} ({remark})"
 
     def _count_pass_throughs(self, now: _State, part: Slice, now_ns: int) -> None:

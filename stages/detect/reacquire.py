@@ -74,7 +74,7 @@ def without_duplicates(candidates: Iterable[Candidate]) -> list[Candidate]:
     kept: dict[tuple[int, ...], Candidate] = {}
     for c in candidates:
         key = tuple(c.path_ns[-DUPLICATE_PASSES:]) if len(c.path_ns) >= DUPLICATE_PASSES else (-c.number,)
-        if key not in kept or c.log_odds > kept[key].log_odds:
+        if key not in kept or c.single_log_odds > kept[key].single_log_odds:
             kept[key] = c
     return list(kept.values())
 
@@ -93,6 +93,7 @@ def reacquired_candidate(c: Candidate, number: int, s: Observation, velocity_mps
         scan_passes=c.scan_passes + 1,
         reacquired_at=c.scan_passes,
         reacquired_ns=s.stamp_ns,
+        first_ns=s.stamp_ns,
         accepted=False,
         announced=False,
         free=c.free.copy(),

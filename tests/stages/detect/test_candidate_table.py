@@ -118,3 +118,18 @@ def test_first_within_returns_the_first_position_within_the_distance():
     assert first_within(positions_m, np.zeros(3), 1.1) == 1
     assert first_within(positions_m, np.zeros(3), 0.4) == -1
     assert first_within(np.empty((0, 3)), np.zeros(3), 9.0) == -1
+
+
+def test_rivals_are_other_objects_observed_in_alternation():
+    made = table(PLACE_M, offset_by(0.0, 1.0, 0.0), offset_by(3.0, 0.0, 0.0), offset_by(0.0, 0.0, 4.0))
+    own, near, rival, before = made
+    own.first_ns = before.seen_ns + 1  # may be the same object, which moved
+    rival.seen_ns = own.seen_ns = own.first_ns + 50_000_000
+    assert [c.number for c in made.rivals_of(own, 2.0)] == [rival.number]
+    assert [c.number for c in made.rivals_of(before, 2.0)] == [near.number, rival.number]  # not with `own`
+    own.first_ns = 0
+    assert [c.number for c in made.rivals_of(own, 2.0)] == [rival.number, before.number]
+    rival.velocity_mps = np.array([-30.0, 0.0, 0.0])
+    own.stamp_ns += 100_000_000
+    assert [c.number for c in made.rivals_of(own, 2.0)] == [before.number]
+    assert list(table(PLACE_M, offset_by(3.0, 0.0, 0.0), promising=False).rivals_of(own, 2.0)) == []

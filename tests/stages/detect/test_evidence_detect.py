@@ -58,6 +58,7 @@ from tests.stages.made import ON_ITS_SIDE, START_NS
 
 TERM = {"alternative": 3, "feature": "range_m", "knots": (0.0, 1.0), "values": (0.0, -4.0)}
 PLACE_M = (0.0, 8.0, 10.0)  # 12.7 m away, 51 deg up
+NEIGHBOUR_M = (0.0, 11.0, 10.0)
 WATCHING = dithering(half_rad=math.radians(1.0))  # as the aim stage does: a beam comes near in each rotor turn
 PASS_DEG = 4.5  # each swing completes a pass: a message every 0.4 s
 MOVING = flying((-0.8, 8.0, 10.0), (0.8, 0.0, 0.4))
@@ -279,6 +280,32 @@ def test_a_hovering_drone_at_close_range_is_accepted_once_a_support_would_be_vis
     assert 1.0 < accepted_after_s(detections) < 4.0
     _, detections = run([hovering(seed)], 4.2, publish=HOVERS, free_space=False)
     assert accepted_after_s(detections) == math.inf
+
+
+def test_of_two_objects_that_both_hover_as_the_drone_neither_is_accepted():
+    other = Drone(still(0.0, -8.0, 10.0), seed=1)
+    assert accepted_after_s(run([hovering()], 4.2, publish=HOVERS)[1]) < 4.2
+    candidates, detections = run([hovering(), other], 4.2, publish=HOVERS)
+    assert accepted_after_s(detections) == math.inf
+    assert candidates[-1].probability.sum() < 1.1  # each is as of its own last observation
+    assert len(candidates[-1].probability) == 2
+    assert all(re.search(r"; other candidates -\d", reason) for reason in candidates[-1].reasons)
+
+
+def test_the_drone_stays_accepted_beside_a_weaker_candidate(monkeypatch):
+    stage = detector()
+    drone, other = (
+        candidate(observation(0.0, place_m), observation(0.1, place_m)) for place_m in (PLACE_M, NEIGHBOUR_M)
+    )
+    other.number = 2
+    accepted = []
+    for log_odds in (-1.0, 4.0):  # of the other candidate; the drone has 5
+        for c, nats in ((other, log_odds), (drone, 5.0), (other, log_odds)):
+            predicted(nats, monkeypatch)
+            stage._classify(stage._now, c)
+            stage._now.table.put(c)
+        accepted.append((drone.accepted, other.accepted))
+    assert accepted == [(True, False), (False, False)]
 
 
 def test_candidates_name_the_detector_instance():

@@ -110,7 +110,7 @@ def test_the_reacquired_candidate_keeps_the_evidence_and_the_original_is_unchang
 def test_of_two_with_the_same_last_observations_the_more_probable_is_kept():
     observations = [observation(0.1 * k, BEFORE_M) for k in range(DUPLICATE_PASSES)]
     one, two, other = candidate(*observations), candidate(*observations), candidate(observation(0.0, BEFORE_M))
-    one.log_odds, two.log_odds, two.number, other.number = 1.0, 2.0, 2, 3
+    one.single_log_odds, two.single_log_odds, two.number, other.number = 1.0, 2.0, 2, 3
     assert [c.number for c in without_duplicates([one, two, other])] == [2, 3]
     assert [c.number for c in without_duplicates([other, candidate(observation(0.0, BEFORE_M))])] == [
         3,

@@ -64,7 +64,8 @@ NEAR_REJECTED_M = 1.5  # a rejected object this close,
 NEAR_REJECTED_NS = 20_000_000_000  # and this recent, makes a new candidate less probable
 REVISITED_M = 0.5  # the same position
 MAX_STATIC = 64  # static objects remembered
-HYSTERESIS_NATS = 1.65  # an accepted candidate is rejected this far below the threshold, by the LiDAR alone
+HYSTERESIS_NATS = 1.65  # an accepted candidate is rejected this far below the threshold, by the LiDAR alone,
+# or where the others would be accepted in its place
 AT_REST_MPS = np.zeros(3)
 COMPARED_NS = 500_000_000  # a cue is compared with a candidate observed this recently,
 COMPARED_PASSES = 5  # in so many scan passes
@@ -311,8 +312,8 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
             remark += f"; other candidates {-others_nats:+.1f}"
         now.classified[c.number] = c
         accept = self._accept_nats
-        kept = c.accepted and c.own_log_odds - others_nats >= accept - HYSTERESIS_NATS
-        c.accepted = c.log_odds >= accept or kept
+        kept = c.own_log_odds >= max(accept - HYSTERESIS_NATS, others_nats - accept)
+        c.accepted = c.log_odds >= accept or (c.accepted and kept)
         before, c.is_promising = c.is_promising, c.single_log_odds >= self._follow_up_nats
         c.was_promising |= c.is_promising
         named = c.is_promising or c.observations > 1  # others are rejected at once

@@ -125,11 +125,12 @@ class LikelihoodTrack(Stage[LikelihoodTrackSettings]):
                     )
                 if uncertain and required <= P:
                     self._hypotheses.move(track, number, xyz, v, int(candidates.seen_ns[i]), candidates.stamp_ns)
-                # an improbable candidate next to a track whose own candidate is probable is another object
+                # an improbable candidate next to a track whose own candidate is probable is another object;
+                # improbable: another one would be accepted in its place
                 is_same_object = track.candidate == number or (
                     candidates.scan_passes[i] >= 6 and track.candidate not in own
                 )
-                if P < 0.2 and track.confirmed and is_same_object:
+                if 1.0 - candidates.accept_probability > P and track.confirmed and is_same_object:
                     yield from self._lose(
                         track, candidates.stamp_ns, f"no longer accepted as a drone: {candidates.reasons[i]}"
                     )

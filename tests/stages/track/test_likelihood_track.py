@@ -327,7 +327,7 @@ def test_a_rejected_candidate_next_to_a_track_does_not_end_it_while_its_own_cand
     trajectory = still(0.0, 8.0, 10.0)
     one, other = (
         candidate(here(trajectory), own, t_s=1.0, scan_passes=30),
-        candidate(here(trajectory), 0.1, t_s=1.0, number=2, scan_passes=6),
+        candidate(here(trajectory), 0.04, t_s=1.0, number=2, scan_passes=6),
     )
     both = Candidates(
         stamp_ns=one.stamp_ns,
@@ -351,7 +351,7 @@ def test_a_rejected_candidate_next_to_a_track_does_not_end_it_while_its_own_cand
 
 def test_a_track_whose_probability_falls_is_lost_with_the_detectors_reason():
     trajectory = still(0.0, 8.0, 10.0)
-    out = run([Drone(trajectory)], [accepted(here(trajectory)), candidate(here(trajectory), 0.1, t_s=1.0)], 2.0)
+    out = run([Drone(trajectory)], [accepted(here(trajectory)), candidate(here(trajectory), 0.04, t_s=1.0)], 2.0)
     (lost,) = [m for m in states_of(out) if m.state is TrackingState.LOST]
     assert lost.stamp_ns == at_s(1.0)
     assert lost.reason == "no longer accepted as a drone: flew as a bird does"

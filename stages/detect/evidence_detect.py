@@ -64,8 +64,9 @@ NEAR_REJECTED_M = 1.5  # a rejected object this close,
 NEAR_REJECTED_NS = 20_000_000_000  # and this recent, makes a new candidate less probable
 REVISITED_M = 0.5  # the same position
 MAX_STATIC = 64  # static objects remembered
-HYSTERESIS_NATS = 1.65  # an accepted candidate is rejected this far below the threshold, by the LiDAR alone,
-# or where the others would be accepted in its place
+# An accepted candidate is rejected this far below the threshold, by the LiDAR alone; for the sake of other candidates
+# only where they would be accepted in its place.
+HYSTERESIS_NATS = 1.65
 AT_REST_MPS = np.zeros(3)
 COMPARED_NS = 500_000_000  # a cue is compared with a candidate observed this recently,
 COMPARED_PASSES = 5  # in so many scan passes
@@ -131,10 +132,10 @@ class EvidenceDetectSettings(Settings):
 
     @model_validator(mode="before")
     @classmethod
-    def _has_a_model(cls, values: dict[str, Any]) -> dict[str, Any]:
-        if values.get("model") is None:
+    def _has_a_model(cls, values: Any) -> Any:
+        if isinstance(values, dict) and values.get("model") is None:  # pyright: ignore[reportUnknownMemberType]
             raise ValueError("it has no model: include models/detector.yaml")
-        return values
+        return values  # pyright: ignore[reportUnknownVariableType]
 
     @model_validator(mode="after")
     def _settings_agree(self) -> EvidenceDetectSettings:
@@ -312,7 +313,8 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
             remark += f"; other candidates {-others_nats:+.1f}"
         now.classified[c.number] = c
         accept = self._accept_nats
-        kept = c.own_log_odds >= max(accept - HYSTERESIS_NATS, others_nats - accept)
+        least = accept - HYSTERESIS_NATS
+        kept = c.own_log_odds >= least and c.own_log_odds - others_nats >= min(least, -accept)
         c.accepted = c.log_odds >= accept or (c.accepted and kept)
         before, c.is_promising = c.is_promising, c.single_log_odds >= self._follow_up_nats
         c.was_promising |= c.is_promising

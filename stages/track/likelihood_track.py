@@ -42,6 +42,7 @@ from stages.messages import (
 from stages.track.hypotheses import Hypotheses, Hypothesis
 from stages.track.scan_pass import ScanPass, collect_into, evaluate
 
+IMPROBABLE = 0.2  # highest probability of a candidate at which its track ends
 PASS_OVER_NS = 4_000_000  # this long after its last pulse a scan pass is complete
 CANDIDATE_S = 1.5  # a hypothesis that is not accepted is removed this long after its last return
 
@@ -125,12 +126,12 @@ class LikelihoodTrack(Stage[LikelihoodTrackSettings]):
                     )
                 if uncertain and required <= P:
                     self._hypotheses.move(track, number, xyz, v, int(candidates.seen_ns[i]), candidates.stamp_ns)
-                # an improbable candidate next to a track whose own candidate is probable is another object;
-                # improbable: another one would be accepted in its place
+                # an improbable candidate next to a track whose own candidate is probable is another object
                 is_same_object = track.candidate == number or (
                     candidates.scan_passes[i] >= 6 and track.candidate not in own
                 )
-                if 1.0 - candidates.accept_probability > P and track.confirmed and is_same_object:
+                improbable = min(IMPROBABLE, 1.0 - candidates.accept_probability)  # others would be accepted instead
+                if improbable > P and track.confirmed and is_same_object:
                     yield from self._lose(
                         track, candidates.stamp_ns, f"no longer accepted as a drone: {candidates.reasons[i]}"
                     )

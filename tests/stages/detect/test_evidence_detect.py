@@ -292,20 +292,27 @@ def test_of_two_objects_that_both_hover_as_the_drone_neither_is_accepted():
     assert all(re.search(r"; other candidates -\d", reason) for reason in candidates[-1].reasons)
 
 
-def test_the_drone_stays_accepted_until_another_candidate_would_be_accepted_in_its_place(monkeypatch):
-    stage = detector()
+@pytest.mark.parametrize(
+    ("accept_probability", "others", "drone_accepted"),  # log-odds of the other candidate; the drone has 5
+    [(0.95, (-1.0, 7.5, 8.5), [True, True, False]), (0.5, (4.5, 6.5, 7.5), [True, True, False])],
+)
+def test_the_drone_stays_accepted_until_another_candidate_would_be_accepted_in_its_place(
+    accept_probability, others, drone_accepted, monkeypatch
+):
+    stage = detector(accept_probability=accept_probability)
     drone, other = (
         candidate(observation(0.0, place_m), observation(0.1, place_m)) for place_m in (PLACE_M, NEIGHBOUR_M)
     )
     other.number = 2
     accepted = []
-    for log_odds in (-1.0, 7.5, 8.5):  # of the other candidate; the drone has 5
+    for log_odds in others:
         for c, nats in ((other, log_odds), (drone, 5.0), (other, log_odds)):
             predicted(nats, monkeypatch)
             stage._classify(stage._now, c)
             stage._now.table.put(c)
-        accepted.append((drone.accepted, other.accepted))
-    assert accepted == [(True, False), (True, False), (False, True)]
+        accepted.append(drone.accepted)
+    assert accepted == drone_accepted
+    assert other.accepted
 
 
 def test_candidates_name_the_detector_instance():

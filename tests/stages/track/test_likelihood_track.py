@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -356,6 +357,18 @@ def test_a_track_whose_probability_falls_is_lost_with_the_detectors_reason():
     assert lost.stamp_ns == at_s(1.0)
     assert lost.reason == "no longer accepted as a drone: flew as a bird does"
     assert max(f.stamp_ns for f in fixes_of(out)) < at_s(1.0)
+
+
+@pytest.mark.parametrize(
+    ("accept_probability", "probability", "lost"),
+    [(0.95, 0.06, False), (0.95, 0.04, True), (0.5, 0.3, False), (0.5, 0.1, True)],
+)
+def test_a_track_ends_where_others_would_be_accepted_in_its_place(accept_probability, probability, lost):
+    trajectory = still(0.0, 8.0, 10.0)
+    falls = candidate(here(trajectory), probability, t_s=1.0)
+    falls = dataclasses.replace(falls, accept_probability=accept_probability)
+    out = run([Drone(trajectory)], [accepted(here(trajectory)), falls], 2.0)
+    assert ("LOST" in story(out)) == lost
 
 
 @pytest.mark.parametrize(("life_since_s", "follows"), [(0.0, False), (0.9, True)])

@@ -103,18 +103,22 @@ def _check_keys(tree: Tree, path: KeyPath, declared: dict[str, Any]) -> None:
 
 
 def _thread(tree: Tree, path: KeyPath, declared: dict[str, Any]) -> str:
-    thread: Any = declared.get("thread", path[1])
+    thread: Any = declared.get("thread")
+    if thread is None:
+        return path[1]
     if not (isinstance(thread, str) and _NAME.match(thread)):
         tree.error((*path, "thread"), f"must be a name as stages have, got {thread!r}.")
     return str(thread)
 
 
 def _process(tree: Tree, path: KeyPath, declared: dict[str, Any]) -> str:
-    process: Any = declared.get("process", "")
+    process: Any = declared.get("process")
+    if process is None:
+        return ""
     if not (isinstance(process, str) and (process == "" or _NAME.match(process))):
         tree.error((*path, "process"), f"must be a name as stages have, got {process!r}.")
-    elif process and "thread" in declared:
-        tree.error((*path, "process"), "in a worker process each stage has its own thread: leave 'thread' out.")
+    elif process and declared.get("thread") is not None:
+        tree.error((*path, "process"), "in a worker process each stage has its own thread: set 'thread' to null.")
     return str(process)
 
 

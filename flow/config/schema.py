@@ -47,8 +47,14 @@ _COPY = {
 }
 _INCLUDES = [{"type": "string"}, _COPY]
 _EDGE = {"$ref": "#/$defs/edge"}
-_THREAD = {"type": "string", "description": "live: stages that name one thread share it; default: a thread for each"}
-_PROCESS = {"type": "string", "description": "worker process; stages that name one process share it"}
+_THREAD = {
+    "type": ["string", "null"],
+    "description": "live: stages that name one thread share it; null (default): a thread for each",
+}
+_PROCESS = {
+    "type": ["string", "null"],
+    "description": "worker process; stages that name one process share it; null (default): the run's own process",
+}
 _LOW_PRIORITY = {"type": "boolean", "description": "live: it takes fewer images while other queues overflow"}
 _NEEDS = {
     "type": "string",

@@ -19,7 +19,7 @@ from stages.align import JointAlign
 from stages.geometry.frames import rotation_z
 from stages.kernels.geometry.so3 import log_rotation
 from stages.messages import CameraMount, Image
-from tests.stages.panoramas import FOLDER, LABELS, grd_stage, random_rotation, render, tilt_at
+from tests.stages.panoramas import FOLDER, LABELS, Conditions, grd_stage, random_rotation, render, tilt_at
 
 COUNT, SEED = int(os.environ.get("GRD_RENDERS", "10")), int(os.environ.get("GRD_RENDERS_SEED", "0"))
 PRIOR_RAD, RIGHT_DEG, NS = math.radians(8.0), 2.0, 1_000_000_000
@@ -43,7 +43,8 @@ def off(R_true: np.ndarray, R_world_vehicle: np.ndarray, R: np.ndarray) -> np.nd
 def pairs(name: str):
     """R_vehicle_drone, R_world_vehicle and the message of each pair."""
     rng = np.random.default_rng([int(name), 7, SEED])
-    vehicle, drone, align = grd_stage(CameraMount.VEHICLE), grd_stage(CameraMount.DRONE), JointAlign()
+    vehicle, drone = (grd_stage(m, Conditions().lens) for m in (CameraMount.VEHICLE, CameraMount.DRONE))
+    align = JointAlign()
     for k in range(COUNT):
         ns = (k + 1) * NS
         up, down = (render(name, m, random_rotation(rng, m), rng) for m in (CameraMount.VEHICLE, CameraMount.DRONE))

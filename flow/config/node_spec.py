@@ -115,10 +115,11 @@ def _process(tree: Tree, path: KeyPath, declared: dict[str, Any]) -> str:
     process: Any = declared.get("process")
     if process is None:
         return ""
-    if not (isinstance(process, str) and (process == "" or _NAME.match(process))):
+    if not (isinstance(process, str) and _NAME.match(process)):
         tree.error((*path, "process"), f"must be a name as stages have, got {process!r}.")
-    elif process and declared.get("thread") is not None:
-        tree.error((*path, "process"), "in a worker process each stage has its own thread: set 'thread' to null.")
+    elif declared.get("thread") is not None:
+        text = "in a worker process each stage has its own thread: leave 'thread' out, or write 'thread: null'."
+        tree.error((*path, "process"), text)
     return str(process)
 
 

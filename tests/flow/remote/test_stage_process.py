@@ -127,7 +127,11 @@ def test_a_blocked_remote_stage_does_not_prevent_the_end_of_the_run(tmp_path):
     [
         ("process: Aside", "must be a name as stages have, got 'Aside'"),
         ("process: 3", "must be a name as stages have, got 3"),
-        ("process: worker, thread: lidar", "in a worker process each stage has its own thread: set 'thread' to null"),
+        ("process: ''", "must be a name as stages have, got ''"),
+        (
+            "process: worker, thread: lidar",
+            "in a worker process each stage has its own thread: leave 'thread' out, or write",
+        ),
     ],
 )
 def test_a_wrong_process_is_an_error_with_its_line(tmp_path, wrong, text):
@@ -143,12 +147,8 @@ def test_null_takes_back_the_thread_and_the_process_of_an_included_file(tmp_path
     (tmp_path / "shared.yaml").write_text(REMOTE.replace("process: worker", "thread: lidar"))
     (tmp_path / "remote.yaml").write_text("include: shared.yaml\nstages: {brittle: {thread: null, process: worker}}\n")
     (tmp_path / "local.yaml").write_text("include: remote.yaml\nstages: {brittle: {process: null}}\n")
-    processes, threads = zip(
-        *((spec.process, spec.thread) for name in ("shared", "remote", "local")
-          for spec in [load_graph(tmp_path / f"{name}.yaml").nodes["brittle"]]), strict=True
-    )  # fmt: skip
-    assert processes == ("", "worker", "")
-    assert threads == ("lidar", "brittle", "brittle")
+    specs = [load_graph(tmp_path / f"{name}.yaml").nodes["brittle"] for name in ("shared", "remote", "local")]
+    assert [(spec.process, spec.thread) for spec in specs] == [("", "lidar"), ("worker", "brittle"), ("", "brittle")]
 
 
 def test_a_stage_whose_messages_cannot_be_encoded_must_not_name_a_process(tmp_path):

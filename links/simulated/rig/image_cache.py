@@ -47,7 +47,7 @@ class ImageCache:
         """Compares the settings of the recording; `cameras` compares its motion."""
         self._file, self._scenario = file, scenario
         with RecordingReader(file) as reader:
-            recorded = _scenario_of(reader)
+            recorded = recorded_scenario(reader)
             platforms = [platform for platform, _ in enabled_cameras(scenario.cameras, scenario.drone is not None)]
             if not platforms:
                 raise LinkError(f"{scenario.name} has no cameras: leave out --images")
@@ -180,8 +180,13 @@ def _delayed(record: Record, delay_ns: int) -> Record:
 
 def image_settings(scenario: Scenario) -> dict[str, Any]:
     """All settings that affect the images and their times; the mount is the true one."""
+    return flight_settings(scenario) | scenario.model_dump(mode="json", include={"cameras"})
+
+
+def flight_settings(scenario: Scenario) -> dict[str, Any]:
+    """All settings that affect the world, the motion in it, and the turntable."""
     settings = scenario.model_dump(mode="json")
-    same = ("seed", "start_utc", "scene", "weather", "vehicle", "drone", "other_drones", "cameras")
+    same = ("seed", "start_utc", "scene", "weather", "vehicle", "drone", "other_drones")
     mount = scenario.mount.model_dump(mode="json")
     flight = None if scenario.autopilot is None else settings["autopilot"]["flight"]
     turntable = {name: mount[name] for name in ("T_vehicle_turntable", "T_turntable_lidar")}
@@ -237,10 +242,10 @@ def _summary(value: Any) -> str:
     return "given" if isinstance(value, Mapping) else str(value)
 
 
-def _scenario_of(reader: RecordingReader) -> Scenario:
-    """The scenario of a recording."""
+def recorded_scenario(reader: RecordingReader) -> Scenario:
+    """The scenario of a recording. LinkError when it has none."""
     if reader.metadata.get("made_by") != "grd simulate" or reader.config_yaml is None:
-        raise LinkError(f"{reader.path} is no simulated recording: --images takes one made by `grd simulate`")
+        raise LinkError(f"{reader.path} is no simulated recording: choose one made by `grd simulate`")
     if not reader.finished:
         raise LinkError(f"{reader.path} is incomplete: {OTHER_FLIGHT}")
     try:

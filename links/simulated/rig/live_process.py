@@ -38,6 +38,7 @@ from links.simulated.autopilot.flight_stack.flight_socket import FlightSocket
 from links.simulated.rig.image_cache import CachedCamera, ImageCache
 from links.simulated.rig.live_images import TimedImageServer
 from links.simulated.rig.live_rig import READY, RIG_REPORT, LiveRigSettings
+from links.simulated.rig.recorded_lidar import RecordedLidar
 from links.simulated.rig.run import Simulation
 from links.simulated.rig.scenario import Scenario, load_scenario
 from links.simulated.sensors.camera import CamerasSettings
@@ -58,21 +59,27 @@ SWITCH_S = 5e-4  # thread switch interval: the thread of the servo must not wait
 class LiveSimulation(Simulation):
     """A scenario that starts on demand, with an emulated servo. Its internal times are those of the scenario."""
 
-    def __init__(self, scenario: Scenario, images: ImageCache | None = None) -> None:
+    def __init__(
+        self, scenario: Scenario, images: ImageCache | None = None, recorded: RecordedLidar | None = None
+    ) -> None:
+        """With a `recorded` LiDAR no rays are cast, and the servo follows the recording."""
         super().__init__(scenario, images=images)
+        self.recorded = recorded
         self.flight_socket: FlightSocket | None = None
         self.packet_ns = self.encoder.packet_ns
         self.ahead_ns = 0
         self.emulator: DynamixelEmulator | None = None
         if self.flight is not None:
             self.flight.stack.advance(scenario.start_ns + WARM_PACKETS * self.packet_ns)
-        self._servo.advance(scenario.start_ns + WARM_PACKETS * self.packet_ns)
-        self.lidar_records(scenario.start_ns, WARM_PACKETS, self.packet_ns)  # compiles all that it uses
+        if recorded is None:
+            self._servo.advance(scenario.start_ns + WARM_PACKETS * self.packet_ns)
+            self.lidar_records(scenario.start_ns, WARM_PACKETS, self.packet_ns)  # compiles all that it uses
 
     def begin(self, servo: Path) -> DynamixelEmulator:
         """Start the scenario now; returns the servo, not yet on its pty."""
+        motor = None if self.recorded is None else self.recorded.servo()
         self.ahead_ns = self.lidar_clock_ns = host_time.now_ns() - self.scenario.start_ns
-        self.emulator = DynamixelEmulator(self.scenario.servo, self.seed, servo, self.now_ns)
+        self.emulator = DynamixelEmulator(self.scenario.servo, self.seed, servo, self.now_ns, motor=motor)
         return self.emulator
 
     @property
@@ -92,9 +99,13 @@ class LiveSimulation(Simulation):
 
     def batch(self, first_ns: int, packets: int) -> tuple[list[Record], list[Record]]:
         """LiDAR packets from a past time on, and their ground truth on the host's clock."""
+        until_ns = first_ns + packets * self.packet_ns
         if self.flight_socket is not None:
-            self.flight_socket.advance(first_ns + packets * self.packet_ns)
-        records = self.lidar_records(first_ns, packets, self.packet_ns)
+            self.flight_socket.advance(until_ns)
+        if self.recorded is None:
+            records = self.lidar_records(first_ns, packets, self.packet_ns)
+        else:
+            records = self.recorded.records(first_ns, until_ns)
         truth = [self._on_host(record) for record in records if record.topic.startswith(TRUTH_TOPICS)]
         return [record for record in records if not record.topic.startswith(TRUTH_TOPICS)], truth
 
@@ -135,11 +146,10 @@ class RealTimeRig:
         scenario = scenario.changed(**{name: value for name, value in overrides.items() if value is not None})
         self._rig, self._folder = rig, folder
         if rig.images is None:  # nothing reads its cameras
-            self._scenario = scenario.changed(cameras=CamerasSettings())
-            self.simulation = LiveSimulation(self._scenario)
-        else:
-            self._scenario = scenario
-            self.simulation = LiveSimulation(scenario, ImageCache(rig.images, scenario))
+            scenario = scenario.changed(cameras=CamerasSettings())
+        images = None if rig.images is None else ImageCache(rig.images, scenario)
+        recorded = None if rig.packets is None else RecordedLidar(rig.packets, scenario)
+        self._scenario, self.simulation = scenario, LiveSimulation(scenario, images, recorded)
         self.late = Latency()  # from the last pulse of a packet to its sending
         self.stop = threading.Event()
         self.packets = self.skipped = self.received = self.images = 0

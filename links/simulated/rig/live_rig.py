@@ -53,6 +53,9 @@ class LiveRigSettings(Settings):
     armed: bool = True  # False: its autopilot reports disarmed, as before a flight (`grd preflight` requires that)
     odometry_port: int | None = Field(None, ge=1, le=65535)  # where grd receives odometry; None: none is sent
     images: Path | None = None  # a recording of the scenario, made by `grd simulate`; None: no cameras
+    # A recording of the scenario whose LiDAR packets are sent, with their recorded stamps (`clock: free`), in place of
+    # cast ones; the servo then moves as recorded. Most of the rig's computing time is ray casting. None: rays are cast.
+    packets: Path | None = None
     camera_ports: dict[CameraMount, Port] = Field(
         default_factory=dict[CameraMount, Port]
     )  # http://127.0.0.1:PORT/ of each

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from links.dynamixel import mx28
 from links.simulated.sensors import protocol2
 from links.simulated.sensors.mx28 import SimulatedMx28
-from links.simulated.sensors.servo import ServoSettings
+from links.simulated.sensors.servo import Servo, ServoSettings
 from stages.geometry.frames import Array64
 
 IDLE_S = 0.02  # period at which the servo moves without requests
@@ -49,10 +49,15 @@ class DynamixelEmulator:
         path: str | Path | None = None,
         now_ns: Callable[[], int] = time.monotonic_ns,
         firmware: int = 45,
+        motor: Servo | None = None,
     ) -> None:
-        """`path`: the link to the pty, by default in a temporary folder. `now_ns`: clock of the servo."""
+        """`path`: the link to the pty, by default in a temporary folder. `now_ns`: clock of the servo.
+
+        `motor`: another one than that of the settings.
+        """
         self._now_ns = now_ns
-        self._servo = SimulatedMx28(settings or ServoSettings(travel_deg=(0.0, 360.0)), seed, now_ns(), firmware)
+        settings = settings or ServoSettings(travel_deg=(0.0, 360.0))
+        self._servo = SimulatedMx28(settings, seed, now_ns(), firmware, motor)
         self._lock = threading.RLock()
         self._folder = None if path else tempfile.TemporaryDirectory(prefix="mx28-")
         self.path = Path(path) if path else Path(self._folder.name) / "servo"  # pyright: ignore[reportOptionalMemberAccess]

@@ -41,8 +41,11 @@ FULL_LOAD = 1000  # Present Load, in 0.1 %
 class SimulatedMx28:
     """One servo. All times are nanoseconds of one monotonic clock."""
 
-    def __init__(self, settings: ServoSettings, seed: int, start_ns: int, firmware: int = 45) -> None:
-        self._servo = Servo(settings)
+    def __init__(
+        self, settings: ServoSettings, seed: int, start_ns: int, firmware: int = 45, servo: Servo | None = None
+    ) -> None:
+        """`servo`: another motor than that of the settings."""
+        self._servo = servo or Servo(settings)
         self._gear_train = GearTrain(settings, seed)
         self._table = bytearray(mx28.TABLE_END)
         for register in mx28.REGISTERS:

@@ -9,14 +9,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from links.evaluation.association import bracket, follow
 from links.runs.results import POSE_COVARIANCE_FILE, POSE_FILE, POSE_UPPER, UPPER_6
 from links.runs.truth import CHI2_95_3, MAX_GAP_NS, TruthLog
+
+if TYPE_CHECKING:  # scipy is imported when a run has ended
+    from scipy.spatial.transform import Rotation
 
 Array64 = NDArray[np.float64]
 FULL = ("FULL", "COASTING")  # states with a position and a rotation
@@ -64,6 +67,8 @@ class FusedPoses:
 
 def read_fused_poses(folder: Path, truth: TruthLog) -> FusedPoses | None:
     """The poses in the folder of a run; None when there are none, or a full disk has cut the files off."""
+    from scipy.spatial.transform import Rotation
+
     try:
         lines = (folder / POSE_FILE).read_text("utf-8").splitlines()[1:]
         head, *rows = (folder / POSE_COVARIANCE_FILE).read_text("utf-8").splitlines()
@@ -100,6 +105,8 @@ def _errors(
     stamps_ns: NDArray[np.int64], xyz_m: Array64, R: Rotation, tracks: NDArray[np.int64], truth: TruthLog
 ) -> tuple[Array64, Array64]:
     """Errors of the positions (n, 3) and of the rotations (n,), against the drone that each track follows."""
+    from scipy.spatial.transform import Rotation
+
     error_m, angle_rad = np.full((len(xyz_m), 3), np.nan), np.full(len(xyz_m), np.nan)
     numbers = [number for number, drone in sorted(truth.drones.items()) if drone.pose]
     paths = [truth.drone_in_vehicle(number) for number in numbers]

@@ -1,18 +1,31 @@
-"""Replays a recording through a graph before a live run, so that all kernels are compiled and loaded at its start.
+"""Compiles and loads all kernels of a graph before a live run.
 
-Without it the first packets wait while kernels compile (seconds after an update) or load (tenths of a second). The
-recording is a committed simulated one with every sensor; its first seconds, until the whole pose is known, reach all
-stages. No state remains: the live run builds its nodes again. The recording is of a VLP-16: where another LiDAR is
-configured, the graph is that on the recording's rig, which runs the same kernels.
+Without it the first packets wait while kernels compile (seconds after an update) or load (tenths of a second). Which
+functions a graph calls, with which types, shows when a recording is replayed through it. The recording is a committed
+simulated one with every sensor; its first seconds, until the whole pose is known, reach all stages. No state remains:
+the live run builds its nodes again. The recording is of a VLP-16: where another LiDAR is configured, the graph is that
+on the recording's rig, which runs the same kernels.
+
+The functions and types are kept beside numba's cache, under a name that depends on the graph's classes and on all
+source. A later start loads these functions in place of the replay.
 
 Source: ours; numba compiles at the first call.
 """
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
+import os
+import pickle
+import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import numba
+
+from flow.compile_cache import ROOT, cache_name
 from flow.config_error import ConfigError
 from flow.graph import Graph
 from flow.link import TRUTH_TOPICS, LinkError
@@ -22,8 +35,10 @@ from links.lidar import Lidar
 from links.recording import Progress, RecordingReader
 from links.runs.request import RunRequest
 from links.runs.shipped import RECORDINGS
+from stages.kernels.compiled import CACHE_FOLDER, FUNCTIONS
 
 RECORDING = RECORDINGS / "experiment_1.mcap"
+SOURCE = ("flow", "links", "stages")  # folders whose code decides which functions are called with which types
 REPLAYED_NS = 6_000_000_000  # of the recording; its pose is FULL before
 
 
@@ -43,7 +58,10 @@ def _models(graph: Graph) -> list[str]:
 
 
 def warm_up(graph: Graph, progress: Progress, recording: Path = RECORDING) -> str | None:
-    """Replay the start of a recording through the graph; None, or the reason why the replay failed or ended early."""
+    """Load all kernels; None, or the reason why the replay of the recording's start failed or ended early."""
+    calls = _calls_file(graph, recording)
+    if _load(calls, progress):
+        return None
     try:
         with RecordingReader(recording) as reader:
             runner = Replay(graph)
@@ -59,4 +77,43 @@ def warm_up(graph: Graph, progress: Progress, recording: Path = RECORDING) -> st
             runner.finish()
     except (LinkError, RunError) as error:
         return f"warm-up on {recording.name} failed, the first messages may be late: {error}"
+    _keep(calls)
     return None
+
+
+def _calls_file(graph: Graph, recording: Path) -> Path:
+    """Where the calls of a graph on a recording are kept."""
+    classes = sorted(f"{spec.cls.__module__}.{spec.cls.__qualname__}" for spec in graph.nodes.values())
+    of = [*classes, str(recording.resolve()), numba.__version__, sys.version]
+    of_graph = hashlib.sha256("\n".join(of).encode()).hexdigest()[:16]
+    return CACHE_FOLDER / f"calls-{of_graph}-{cache_name(ROOT / name for name in SOURCE)}.pickle"
+
+
+def _load(calls: Path, progress: Progress) -> bool:
+    """Load the functions with the kept types from numba's cache. False: none are kept, or the file is damaged."""
+    functions = {_name(function): function for function in FUNCTIONS}
+    try:
+        kept: dict[tuple[str, str], Any] = pickle.loads(calls.read_bytes())
+    except (OSError, EOFError, pickle.UnpicklingError):
+        return False
+    if kept.keys() - functions.keys():
+        return False
+    for done, (name, signatures) in enumerate(kept.items(), 1):
+        for signature in signatures:
+            functions[name].compile(signature)
+        progress(done, len(kept))
+    return True
+
+
+def _keep(calls: Path) -> None:
+    """Keep which functions were called with which types."""
+    kept = {_name(function): function.signatures for function in FUNCTIONS if function.signatures}
+    with contextlib.suppress(OSError):  # a full or read-only disk: the next start replays
+        calls.parent.mkdir(parents=True, exist_ok=True)
+        part = calls.with_suffix(f".{os.getpid()}")
+        part.write_bytes(pickle.dumps(kept))
+        part.replace(calls)
+
+
+def _name(function: Any) -> tuple[str, str]:
+    return function.py_func.__module__, function.py_func.__qualname__

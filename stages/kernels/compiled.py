@@ -18,11 +18,13 @@ F = TypeVar("F", bound=Callable[..., Any])
 COMPILED = ("stages/kernels", "links/simulated/kernels")  # folders with compiled functions
 CACHE_FOLDER = folder_of(COMPILED)
 config.CACHE_DIR = str(CACHE_FOLDER)  # pyright: ignore
+FUNCTIONS: list[Any] = []  # all compiled functions of the imported modules: numba's dispatchers
 
 
 def compiled(function: F) -> F:
     """`numba.njit(cache=True, nogil=True)`: IEEE arithmetic, so that two machines agree."""
-    return cast(F, numba.njit(cache=True, nogil=True)(function))  # pyright: ignore
+    FUNCTIONS.append(numba.njit(cache=True, nogil=True)(function))  # pyright: ignore
+    return cast(F, FUNCTIONS[-1])
 
 
 def compiled_at_once(types: str) -> Callable[[F], F]:

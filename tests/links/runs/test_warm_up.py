@@ -10,7 +10,8 @@ from links.lidar import Lidar
 from links.recording import RecordingWriter
 from links.runs.request import RunRequest
 from links.runs.shipped import CONFIGS
-from links.runs.warm_up import RECORDING, warm_up, warm_up_graph
+from links.runs.warm_up import RECORDING, REPLAYED_NS, warm_up, warm_up_graph
+from stages.kernels.compiled import compiled
 
 GRAPH = """\
 stages:
@@ -18,6 +19,12 @@ stages:
 links:
   line: {use: tests.flow.live_toys.Line}
 """
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path, monkeypatch):
+    monkeypatch.setattr("links.runs.warm_up.CACHE_FOLDER", tmp_path / "cache")
+    return tmp_path / "cache"
 
 
 @pytest.fixture
@@ -38,6 +45,45 @@ def test_the_graph_runs_over_the_whole_recording_and_reports_progress(graph, tmp
     progress = []
     assert warm_up(graph, lambda done, total: progress.append((done, total)), recording(tmp_path, b"1", b"2")) is None
     assert progress[-1][0] == progress[-1][1] > 0
+
+
+@compiled
+def twice(number: int) -> int:
+    """Twice a number."""
+    return 2 * number
+
+
+def test_a_later_start_loads_the_functions_that_were_called_in_place_of_the_replay(graph, tmp_path, monkeypatch):
+    one, progress = recording(tmp_path, b"1"), []
+    twice(2)
+    assert warm_up(graph, lambda done, total: None, one) is None
+    one.unlink()
+    loaded = []
+    monkeypatch.setattr(type(twice), "compile", lambda function, types: loaded.append((function, types)))
+    assert warm_up(graph, lambda done, total: progress.append((done, total)), one) is None
+    assert (twice, twice.signatures[0]) in loaded
+    assert progress[-1][0] == progress[-1][1]
+
+
+@pytest.mark.parametrize("damage", [b"", b"no pickle", None])
+def test_without_a_file_of_the_calls_the_recording_is_replayed(graph, tmp_path, cache, damage):
+    one = recording(tmp_path, b"1")
+    assert warm_up(graph, lambda done, total: None, one) is None
+    (kept,) = cache.glob("calls-*.pickle")
+    kept.unlink() if damage is None else kept.write_bytes(damage)
+    progress = []
+    assert warm_up(graph, lambda done, total: progress.append(total), one) is None
+    assert progress[-1] == REPLAYED_NS
+    assert len(list(cache.iterdir())) == 1
+    assert kept.stat().st_size > 20
+
+
+def test_a_function_that_no_longer_exists_is_replayed(graph, tmp_path, monkeypatch):
+    one, progress = recording(tmp_path, b"1"), []
+    assert warm_up(graph, lambda done, total: None, one) is None
+    monkeypatch.setattr("links.runs.warm_up.FUNCTIONS", [])
+    assert warm_up(graph, lambda done, total: progress.append(total), one) is None
+    assert progress[-1] == REPLAYED_NS
 
 
 def test_a_stage_that_raises_and_a_missing_recording_are_only_reported(graph, tmp_path):

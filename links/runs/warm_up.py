@@ -20,10 +20,9 @@ import os
 import pickle
 import sys
 from dataclasses import replace
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
-
-import numba
 
 from flow.compile_cache import ROOT, cache_name
 from flow.config_error import ConfigError
@@ -84,7 +83,7 @@ def warm_up(graph: Graph, progress: Progress, recording: Path = RECORDING) -> st
 def _calls_file(graph: Graph, recording: Path) -> Path:
     """Where the calls of a graph on a recording are kept."""
     classes = sorted(f"{spec.cls.__module__}.{spec.cls.__qualname__}" for spec in graph.nodes.values())
-    of = [*classes, str(recording.resolve()), numba.__version__, sys.version]
+    of = [*classes, str(recording.resolve()), version("numba"), sys.version]
     of_graph = hashlib.sha256("\n".join(of).encode()).hexdigest()[:16]
     return CACHE_FOLDER / f"calls-{of_graph}-{cache_name(ROOT / name for name in SOURCE)}.pickle"
 

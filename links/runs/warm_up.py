@@ -17,12 +17,9 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
-import pickle
 import sys
 from dataclasses import replace
-from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 from flow.compile_cache import ROOT, cache_name
 from flow.config_error import ConfigError
@@ -34,7 +31,7 @@ from links.lidar import Lidar
 from links.recording import Progress, RecordingReader
 from links.runs.request import RunRequest
 from links.runs.shipped import RECORDINGS
-from stages.kernels.compiled import CACHE_FOLDER, FUNCTIONS
+from stages.kernels.calls import FOLDER, VERSION, calls_made, load_calls
 
 RECORDING = RECORDINGS / "experiment_1.mcap"
 SOURCE = ("flow", "links", "stages")  # folders whose code decides which functions are called with which types
@@ -59,7 +56,7 @@ def _models(graph: Graph) -> list[str]:
 def warm_up(graph: Graph, progress: Progress, recording: Path = RECORDING) -> str | None:
     """Load all kernels; None, or the reason why the replay of the recording's start failed or ended early."""
     calls = _calls_file(graph, recording)
-    if _load(calls, progress):
+    if calls.is_file() and load_calls(calls.read_bytes(), progress):
         return None
     try:
         with RecordingReader(recording) as reader:
@@ -81,38 +78,16 @@ def warm_up(graph: Graph, progress: Progress, recording: Path = RECORDING) -> st
 
 
 def _calls_file(graph: Graph, recording: Path) -> Path:
-    """Where the calls of a graph on a recording are kept."""
+    """Where the calls of a graph on a recording are kept; its name changes with all that decides about them."""
     classes = sorted(f"{spec.cls.__module__}.{spec.cls.__qualname__}" for spec in graph.nodes.values())
-    of = [*classes, str(recording.resolve()), version("numba"), sys.version]
-    of_graph = hashlib.sha256("\n".join(of).encode()).hexdigest()[:16]
-    return CACHE_FOLDER / f"calls-{of_graph}-{cache_name(ROOT / name for name in SOURCE)}.pickle"
-
-
-def _load(calls: Path, progress: Progress) -> bool:
-    """Load the functions with the kept types from numba's cache. False: none are kept, or the file is damaged."""
-    functions = {_name(function): function for function in FUNCTIONS}
-    try:
-        kept: dict[tuple[str, str], Any] = pickle.loads(calls.read_bytes())
-    except (OSError, EOFError, pickle.UnpicklingError):
-        return False
-    if kept.keys() - functions.keys():
-        return False
-    for done, (name, signatures) in enumerate(kept.items(), 1):
-        for signature in signatures:
-            functions[name].compile(signature)
-        progress(done, len(kept))
-    return True
+    source = cache_name(ROOT / name for name in SOURCE)
+    of = "\n".join([*classes, str(recording.resolve()), source, sys.version, VERSION])
+    return FOLDER / f"calls-{hashlib.sha256(of.encode()).hexdigest()[:16]}.pickle"
 
 
 def _keep(calls: Path) -> None:
-    """Keep which functions were called with which types."""
-    kept = {_name(function): function.signatures for function in FUNCTIONS if function.signatures}
     with contextlib.suppress(OSError):  # a full or read-only disk: the next start replays
         calls.parent.mkdir(parents=True, exist_ok=True)
         part = calls.with_suffix(f".{os.getpid()}")
-        part.write_bytes(pickle.dumps(kept))
+        part.write_bytes(calls_made())
         part.replace(calls)
-
-
-def _name(function: Any) -> tuple[str, str]:
-    return function.py_func.__module__, function.py_func.__qualname__

@@ -23,7 +23,7 @@ links:
 
 @pytest.fixture(autouse=True)
 def cache(tmp_path, monkeypatch):
-    monkeypatch.setattr("links.runs.warm_up.CACHE_FOLDER", tmp_path / "cache")
+    monkeypatch.setattr("links.runs.warm_up.FOLDER", tmp_path / "cache")
     return tmp_path / "cache"
 
 
@@ -81,7 +81,7 @@ def test_without_a_file_of_the_calls_the_recording_is_replayed(graph, tmp_path, 
 def test_a_function_that_no_longer_exists_is_replayed(graph, tmp_path, monkeypatch):
     one, progress = recording(tmp_path, b"1"), []
     assert warm_up(graph, lambda done, total: None, one) is None
-    monkeypatch.setattr("links.runs.warm_up.FUNCTIONS", [])
+    monkeypatch.setattr("stages.kernels.calls.FUNCTIONS", [])
     assert warm_up(graph, lambda done, total: progress.append(total), one) is None
     assert progress[-1] == REPLAYED_NS
 

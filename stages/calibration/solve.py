@@ -111,7 +111,8 @@ def linearise(
     robust = np.sqrt(np.minimum(1.0, HUBER / np.maximum(scaled / scale, 1e-9)))
     weight = robust / patches.sigma_m
     both = without_planes(np.column_stack([columns, patches.residual_m]), weight, patches)
-    return System(both[:, :-1], both[:, -1], patches, placed, chosen, weight)
+    columns = np.ascontiguousarray(both[:, :-1])  # a view's products would be ten times slower
+    return System(columns, both[:, -1], patches, placed, chosen, weight)
 
 
 def solve(returns: Returns, trace: ServoTrace, rig: ServoMount, max_gap_s: float) -> Solution | None:

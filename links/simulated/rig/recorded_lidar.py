@@ -69,13 +69,15 @@ class RecordedLidar:
     def servo(self) -> RecordedServo:
         """The servo, at the start of the flight. Between readings its position is interpolated."""
         readings: list[tuple[int, float]] = []
+        end_ns = round(1e9 * self._scenario.duration_s)
         with RecordingReader(self._file) as reader:
             for record in reader.records([SERVO]):
                 since_ns = record.stamp_ns - self._scenario.start_ns
                 readings.append((since_ns, float(json.loads(record.data)["position_rad"])))
+                if since_ns > end_ns:
+                    break
         since_start_ns, position_rad = np.array(sorted(readings)).T
-        steps = round(1e9 * self._scenario.duration_s) // STEP_NS
-        at_ns = STEP_NS * np.arange(steps + 1, dtype=np.float64)
+        at_ns = np.arange(0, end_ns + 1, STEP_NS, dtype=np.float64)
         return RecordedServo(self._scenario.servo, np.interp(at_ns, since_start_ns, position_rad))
 
     def records(self, first_ns: int, until_ns: int) -> list[Record]:

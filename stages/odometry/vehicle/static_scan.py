@@ -20,13 +20,13 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stages.geometry.frames import Array64
 from stages.geometry.rig_lidar import RigLidar
+from stages.kernels.odometry.revolution import Poses, columns_in_map
 from stages.kernels.odometry.scan_residuals import Revolution, scan_residuals
 from stages.messages import SweptPulses
 
@@ -123,43 +123,28 @@ class StaticScan:
         return None if before is None else velocity_error(before, revolution, fan.between_rad, last[0][:, 0])
 
 
-def _in_map(fan: Fan, posed: PosedSlice) -> tuple[Array64, Array64]:
-    """Directions (f, k, 3) and origins (f, 3) of a slice's firings in frame map, by poses interpolated linearly."""
-    stamp_ns = posed.pulses.point_stamp_ns[:: fan.lasers]
-    share = ((stamp_ns - stamp_ns[0]) / max(int(posed.pulses.point_stamp_ns[-1] - stamp_ns[0]), 1))[:, None]
-    (R_0, t_0), (R_1, t_1) = posed.first, posed.last
-    R = R_0 + share[..., None] * (R_1 - R_0)
-    directions = posed.pulses.direction_vehicle.reshape(-1, fan.lasers, 3)[:, fan.used].astype(np.float64)
-    return directions @ R.transpose(0, 2, 1), R @ np.array(posed.pulses.origin_vehicle_m) + t_0 + share * (t_1 - t_0)
-
-
 def revolution_of(fan: Fan, slices: list[PosedSlice], turned_rad: float) -> Revolution:
-    """The slices' firings as columns of one azimuth: column c has the pulse of firing c - shift of each laser."""
-    turned, origins = zip(*(_in_map(fan, posed) for posed in slices), strict=True)
-    directions, origin_m = np.concatenate(turned), np.concatenate(origins)
-    range_m, stamp_ns = (
-        np.concatenate([getattr(posed.pulses, name).reshape(-1, fan.lasers)[:, fan.used] for posed in slices])
-        for name in ("range_m", "point_stamp_ns")
+    """The slices' firings as columns of one azimuth."""
+    direction, range_m, stamp_ns = (
+        np.concatenate([getattr(posed.pulses, name) for posed in slices])
+        for name in ("direction_vehicle", "range_m", "point_stamp_ns")
     )
-    range_m = range_m.astype(np.float64)
-    step_rad = turned_rad / len(range_m)
+    firings = len(range_m) // fan.lasers
+    begin = np.cumsum([0, *(len(posed.pulses.range_m) // fan.lasers for posed in slices)])
+    ends = zip(*((*posed.first, *posed.last, np.array(posed.pulses.origin_vehicle_m)) for posed in slices), strict=True)
+    step_rad = turned_rad / firings
     shift = np.rint(fan.azimuth_rad / step_rad).astype(np.int64)
-    first, end = shift.max(), len(range_m) + shift.min()
-
-    def columns(of_firings: NDArray[Any]) -> NDArray[Any]:
-        return np.stack([of_firings[first - n : end - n, k] for k, n in enumerate(shift)], axis=1)
-
-    frame = fan.weights @ columns(directions)
-    frame /= np.linalg.norm(frame, axis=2, keepdims=True)
-    return Revolution(
-        stamp_ns=columns(stamp_ns),
-        xyz_m=columns(origin_m[:, None] + directions * range_m[..., None]),
-        range_m=columns(range_m),
-        origin_m=origin_m[first:end],
-        radial=np.ascontiguousarray(frame[:, 0]),
-        axis=np.ascontiguousarray(frame[:, 1]),
-        step_rad=step_rad,
+    columns = columns_in_map(
+        direction.reshape(firings, fan.lasers, 3),
+        range_m.reshape(firings, fan.lasers),
+        stamp_ns.reshape(firings, fan.lasers),
+        begin,
+        Poses(*map(np.stack, ends)),
+        fan.used,
+        shift,
+        fan.weights,
     )
+    return Revolution(*columns, step_rad)
 
 
 def velocity_error(before: Revolution, now: Revolution, between_rad: Array64, forward: Array64) -> VelocityError | None:

@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from flow import NUMPY, OPENBLAS, use_portable_kernels
+from flow import NUMPY, OPENBLAS, THREADS, use_portable_kernels
 
 x86_only = pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="kernels of x86-64")
 
@@ -35,6 +35,13 @@ def test_the_kernels_for_avx2_are_used_where_the_processor_has_it(tmp_path, flag
     assert selected(tmp_path, flags) == kernels
 
 
+@pytest.mark.parametrize(("chosen", "threads"), [({}, "1"), ({THREADS: "4"}, "4")])
+def test_blas_uses_one_thread_unless_the_user_chooses_another_number(tmp_path, chosen, threads):
+    environment = dict(chosen)
+    use_portable_kernels(environment, tmp_path / "none")
+    assert environment[THREADS] == threads
+
+
 @x86_only
 def test_the_users_choice_remains(tmp_path):
     chosen = {OPENBLAS: "Zen", NUMPY: "X86_V3"}
@@ -54,13 +61,13 @@ import os, sys
 class Watch:
     def find_spec(self, name, path=None, target=None):
         if name == "numpy":
-            print("numpy is loaded with", os.environ.get("{OPENBLAS}"))
+            print("numpy is loaded with", os.environ.get("{OPENBLAS}"), os.environ.get("{THREADS}"), "thread")
 
 sys.meta_path.insert(0, Watch())
 import links.cli, links.evaluation.errors
 """
-    environment = {name: value for name, value in os.environ.items() if name not in (OPENBLAS, NUMPY)}
+    environment = {name: value for name, value in os.environ.items() if name not in (OPENBLAS, NUMPY, THREADS)}
     done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True)
     expected: dict[str, str] = {}
     use_portable_kernels(expected)
-    assert f"numpy is loaded with {expected.get(OPENBLAS)}" in done.stdout
+    assert f"numpy is loaded with {expected.get(OPENBLAS)} 1 thread" in done.stdout

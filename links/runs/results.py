@@ -280,8 +280,14 @@ class Results(Tap[ResultsSettings]):
             self._candidates.writerow([*head, *message.feature_names])
         for i, number in enumerate(message.candidate_id.tolist()):
             xyz = [f"{v:.3f}" for v in message.xyz_vehicle_m[i].tolist()]
-            features = ["" if math.isnan(v) else f"{v:.5g}" for v in message.features[i].tolist()]
-            values = [number, message.detector_instance, f"{message.probability[i]:.6g}", *xyz, *features]
+            features = (len(message.feature_names) * ",%.5g" % tuple(message.features[i].tolist())).replace("nan", "")
+            values = [
+                number,
+                message.detector_instance,
+                f"{message.probability[i]:.6g}",
+                *xyz,
+                *features[1:].split(","),
+            ]
             self._candidates.writerow([stamp_s(int(message.seen_ns[i])), *values])
 
     def _write_rotation(self, output: str, message: RelativeRotation) -> None:

@@ -61,6 +61,15 @@ class Observation:
     large_object_m: float  # distance to the nearest large object; inf: none
 
 
+def return_count_nats(s: Observation) -> float:
+    """Log ratio of the number of returns of one scan pass, drone over wire [nats]."""
+    few = s.returns <= max(1.0, FEW_RETURNS_M / s.range_m)
+    if not few and s.returns <= SOME_RETURNS_M / s.range_m:
+        return 0.0
+    alone = min(max(SINGLE_RETURN_PER_M * s.range_m, 0.1), 0.7)
+    return math.log(alone / WIRE_SINGLE_RETURN) if few else math.log((1 - alone) / (1 - WIRE_SINGLE_RETURN))
+
+
 @dataclass(slots=True, eq=False)
 class Candidate:
     """Position and velocity in the map frame by a Kalman filter with equal axes, and the evidence so far."""
@@ -154,12 +163,7 @@ class Candidate:
         self.observations += 1
         self.returns += s.returns
         self.too_long_passes += s.too_long
-        alone = min(max(SINGLE_RETURN_PER_M * s.range_m, 0.1), 0.7)
-        few = s.returns <= max(1.0, FEW_RETURNS_M / s.range_m)
-        if few or s.returns > SOME_RETURNS_M / s.range_m:
-            self.return_count_nats += (
-                math.log(alone / WIRE_SINGLE_RETURN) if few else math.log((1 - alone) / (1 - WIRE_SINGLE_RETURN))
-            )
+        self.return_count_nats += return_count_nats(s)
         self.round_chords += s.round_chords
         self.rough_chords += s.rough_chords
         weight, measured = neighbour_score(s.isolation, self.free)
@@ -206,12 +210,12 @@ class Candidate:
     def _update_motion(self) -> None:
         """Fit the recent motion; accumulate the time in which it flew as no bird does, or stayed over a pause."""
         self.motion = self.slower_motion = None
+        if len(self.path_ns) < 2:
+            return
         motions = fit_motion(self.path_ns, (self.path_m, self.relative_path_m), self.range_m)
         if motions is not None:
             self.motion, relative = motions
             self.slower_motion = relative if relative.top_mps < self.motion.top_mps else self.motion
-        if len(self.path_ns) < 2:
-            return
         since_s = (self.path_ns[-1] - self.path_ns[-2]) * 1e-9
         displacement_m = float(np.linalg.norm(self.path_m[-1] - self.path_m[-2]))
         flown = self.slower_motion

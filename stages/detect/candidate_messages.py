@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,13 +20,23 @@ from stages.kernels.geometry.trajectory import positions_in_vehicle
 from stages.messages import CandidateEvidence, CandidateLog, Candidates, Detections
 
 
+class Classified(NamedTuple):
+    """A candidate's newest classification, at its last observation."""
+
+    number: int
+    seen_ns: int
+    xyz_map_m: Array64  # (3,)
+    log_odds: float
+    features: Array64
+
+
 def candidate_log(
-    classified: Iterable[Candidate], trail: VehicleTrajectory, now_ns: int, detector_instance: int
+    classified: Iterable[Classified], trail: VehicleTrajectory, now_ns: int, detector_instance: int
 ) -> CandidateLog:
-    """The classified candidates of a slice, each at its last observation."""
+    """The classified candidates of a slice."""
     listed = list(classified)
     seen_ns = np.array([c.seen_ns for c in listed], dtype=np.int64)
-    xyz_map_m = np.array([c.path_m[-1] for c in listed]).reshape(-1, 3)
+    xyz_map_m = np.array([c.xyz_map_m for c in listed]).reshape(-1, 3)
     return CandidateLog(
         stamp_ns=now_ns,
         candidate_id=np.array([c.number for c in listed], dtype=np.int64),

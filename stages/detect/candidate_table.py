@@ -32,6 +32,7 @@ class CandidateTable:
         self._promising = np.empty(ROWS, dtype=np.bool_)
         self._reacquired = np.empty(ROWS, dtype=np.bool_)
         self._found = np.empty((ROWS, 3), dtype=np.int64)  # results of the last slice, by row
+        self._promising_ns = -1  # no promising candidate was observed later
 
     def __iter__(self) -> Iterator[Candidate]:
         return iter(self._candidates)
@@ -51,6 +52,8 @@ class CandidateTable:
                     np.resize(self._reacquired, 2 * row),
                 )
                 self._found = np.empty((2 * row, 3), dtype=np.int64)
+        if c.is_promising:
+            self._promising_ns = max(self._promising_ns, c.seen_ns)
         self._state[row] = (*c.xyz_m.tolist(), *c.velocity_mps.tolist(), *c.p)
         self._ns[row], self._promising[row], self._reacquired[row] = (
             (c.stamp_ns, c.seen_ns),
@@ -60,7 +63,7 @@ class CandidateTable:
 
     def keep(self, kept: Iterable[Candidate]) -> None:
         """Remove all other candidates."""
-        self._candidates, self._rows = [], {}
+        self._candidates, self._rows, self._promising_ns = [], {}, -1
         for c in kept:
             self.put(c)
 
@@ -73,8 +76,14 @@ class CandidateTable:
         reacquired, other = (self._candidates[row] if row >= 0 else None for row in found)
         return reacquired, other
 
+    def has_promising_since(self, stamp_ns: int) -> bool:
+        """Whether a promising candidate may have been observed at this time or later."""
+        return self._promising_ns >= stamp_ns
+
     def rivals_of(self, c: Candidate, apart_m: float) -> Iterator[Candidate]:
         """The promising candidates that are another object: observed in alternation with `c`, `apart_m` away."""
+        if not self.has_promising_since(c.first_ns):
+            return
         for row in np.flatnonzero(self._promising[: len(self._candidates)]).tolist():
             other = self._candidates[row]
             if other.seen_ns >= c.first_ns and c.seen_ns >= other.first_ns and other.number != c.number:

@@ -28,7 +28,13 @@ from pydantic import Field, model_validator
 from flow.stage import Settings, Stage
 from stages.cues.evidence import CueEvidence, CueWeights, ObjectPath, ObjectState
 from stages.detect.candidate import SAME_PASS_NS, START_SPEED_MPS, STATIC_M, Alternative, Candidate, Observation
-from stages.detect.candidate_messages import candidate_log, candidates_message, detections_message, log_odds_of
+from stages.detect.candidate_messages import (
+    Classified,
+    candidate_log,
+    candidates_message,
+    detections_message,
+    log_odds_of,
+)
 from stages.detect.candidate_table import CandidateTable, positions_of
 from stages.detect.flight import scatter_m
 from stages.detect.isolation import LargeObjectMap
@@ -36,8 +42,8 @@ from stages.detect.observations import ObservationFinder, ObservationLimits, Sli
 from stages.detect.reacquire import reacquired_candidate, without_duplicates
 from stages.detect.telemetry import DetectorTelemetry
 from stages.detect.trained.existence import FalseReturns, birth_nats, passed_nats
-from stages.detect.trained.features import FREE_SPACE, features_of
-from stages.detect.trained.model import ALTERNATIVES, LEAST_NATS, DetectorModel, reasons_of
+from stages.detect.trained.features import FREE_SPACE, features_of, first_features
+from stages.detect.trained.model import ALTERNATIVES, LEAST_NATS, DetectorModel, Prediction, reasons_of
 from stages.geometry.frames import Array64
 from stages.geometry.rig_lidar import RigLidar
 from stages.geometry.trajectory import VehicleTrajectory
@@ -98,7 +104,7 @@ class _State:
     static_m: Array64 = field(default_factory=lambda: np.empty((0, 3)))  # their positions
     rejected_map: LargeObjectMap = field(default_factory=LargeObjectMap)
     false_returns: FalseReturns = field(default_factory=FalseReturns)
-    classified: dict[int, Candidate] = field(default_factory=dict[int, Candidate])  # in this slice
+    classified: dict[int, Classified] = field(default_factory=dict[int, Classified])  # in this slice
     watches: dict[int, _Watch] = field(default_factory=lambda: dict[int, _Watch]())
     rejected: Counter[str] = field(default_factory=Counter[str])
     pruned_ns: int = 0
@@ -237,6 +243,12 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
         if reacquired is None and not near_rejected and not math.isfinite(s.large_object_m):
             self._reacquire(now, s)
         now.number += 1
+        false_per_s = now.false_returns.per_s(s.range_m, s.stamp_ns)
+        revisited = rejected_m < REVISITED_M and now.telemetry.moves(s.stamp_ns)
+        if self._rejected_at_once(
+            now, s, first_features(s, self.settings.span_m, false_per_s, near_rejected, revisited)
+        ):
+            return False
         new = Candidate(
             number=now.number,
             stamp_ns=s.stamp_ns,
@@ -247,20 +259,42 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
             p=(SIGMA_M**2, 0.0, START_SPEED_MPS**2),
             first_returns=s.returns,
             first_ns=s.stamp_ns,
-            false_per_s=now.false_returns.per_s(s.range_m, s.stamp_ns),
+            false_per_s=false_per_s,
+            existence_nats=birth_nats(false_per_s),
+            near_rejected=near_rejected,
+            revisited=revisited,
         )
-        new.existence_nats = birth_nats(new.false_per_s)
-        new.near_rejected, new.revisited = near_rejected, rejected_m < REVISITED_M and now.telemetry.moves(s.stamp_ns)
         new.add_observation(s)
         changed = self._classify(now, new)
         if new.is_promising:
             new.velocity_mps = now.trail.velocity_mps(s.stamp_ns)  # a drone follows the vehicle
             now.table.put(new)
         else:
-            now.rejected[new.alternative.value] += 1
-            now.false_returns.add(new.range_m, new.seen_ns)
-            self._remember_rejected(now, new)
+            self._reject(now, s, new.alternative)
         return changed
+
+    def _rejected_at_once(self, now: _State, s: Observation, features: Array64) -> bool:
+        """Reject a first observation that is not promising by its features; False: others or cues count, too."""
+        if now.cues.known or now.table.has_promising_since(s.stamp_ns):
+            return False
+        prediction = self._predict(features)
+        if prediction.log_odds >= self._follow_up_nats:
+            return False
+        now.classified[now.number] = Classified(now.number, s.stamp_ns, s.xyz_map_m, prediction.log_odds, features)
+        self._reject(now, s, ALTERNATIVES[prediction.alternative])
+        return True
+
+    def _reject(self, now: _State, s: Observation, alternative: Alternative) -> None:
+        """Count a rejected first observation, and remember its position if it is of a static object."""
+        now.rejected[alternative.value] += 1
+        now.false_returns.add(s.range_m, s.stamp_ns)
+        if alternative is Alternative.STATIC:
+            now.rejected_map.add(s.xyz_map_m[None], s.stamp_ns)
+
+    def _predict(self, features: Array64) -> Prediction:
+        if not self.settings.free_space:
+            features[list(FREE_SPACE)] = math.nan
+        return self.settings.model.predict(features)
 
     def _update(self, now: _State, c: Candidate, s: Observation) -> bool:
         """Update a candidate with an observation. True: publish a change."""
@@ -294,16 +328,13 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
 
     def _classify(self, now: _State, c: Candidate) -> bool:
         """Classify a candidate again. True: publish a change."""
-        settings = self.settings
         motion_known = self._motion_known(c.seen_ns)
         log_ratios = now.telemetry.of(c, motion_known)
         c.add_log_ratios(log_ratios)
         # the odometry was made with the same IMU: it counts once
         c.imu_log_ratios = now.telemetry.by_imu(c, motion_known) if log_ratios is None else None
-        c.features = features_of(c, settings.span_m, motion_known)
-        if not settings.free_space:
-            c.features[list(FREE_SPACE)] = math.nan
-        prediction = settings.model.predict(c.features)
+        c.features = features_of(c, self.settings.span_m, motion_known)
+        prediction = self._predict(c.features)
         c.alternative = ALTERNATIVES[prediction.alternative]
         c.single_log_odds = c.own_log_odds = prediction.log_odds
         remark = self._add_cues(now, c)
@@ -311,7 +342,7 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
         c.log_odds = c.single_log_odds - others_nats
         if others_nats >= LEAST_NATS:
             remark += f"; other candidates {-others_nats:+.1f}"
-        now.classified[c.number] = c
+        now.classified[c.number] = Classified(c.number, c.seen_ns, c.path_m[-1], c.log_odds, c.features)
         accept = self._accept_nats
         least = accept - HYSTERESIS_NATS
         kept = c.own_log_odds >= least and c.own_log_odds - others_nats >= min(least, -accept)

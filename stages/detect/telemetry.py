@@ -82,8 +82,11 @@ class DetectorTelemetry:
 
     def moves(self, stamp_ns: int) -> bool:
         """Whether the drone reports that it flies: then it is not a static object seen before."""
-        speeds = (telemetry.speed_mps(stamp_ns) for telemetry in self._both)
-        return any(speed is not None and math.hypot(*speed) > MOVES_MPS for speed in speeds)
+        for telemetry in self._both:  # asked for every observation of a static object
+            speed = telemetry.speed_mps(stamp_ns)
+            if speed is not None and math.hypot(*speed) > MOVES_MPS:
+                return True
+        return False
 
     def expected_motion(self, trail: VehicleTrajectory, now_ns: int) -> tuple[Array64, float, float]:
         """Expected velocity (3,) of a drone, its sigma on each axis, and the level speed that it reports (0: none).

@@ -125,6 +125,10 @@ def test_rivals_are_other_objects_observed_in_alternation():
     own, near, rival, before = made
     own.first_ns = before.seen_ns + 1  # may be the same object, which moved
     rival.seen_ns = own.seen_ns = own.first_ns + 50_000_000
+    made.put(rival)
+    made.put(own)
+    assert made.has_promising_since(own.seen_ns)
+    assert not made.has_promising_since(own.seen_ns + 1)
     assert [c.number for c in made.rivals_of(own, 2.0)] == [rival.number]
     assert [c.number for c in made.rivals_of(before, 2.0)] == [near.number, rival.number]  # not with `own`
     own.first_ns = 0

@@ -10,9 +10,17 @@ import pytest
 
 from stages.detect.flight import lamp_sway_m
 from stages.detect.motion_log_ratios import MotionLogRatios
-from stages.detect.trained.features import FEATURES, NAMES, NOT_DISPLACED_NATS, PULSE_RAD, features_of
+from stages.detect.trained.existence import birth_nats
+from stages.detect.trained.features import (
+    FEATURES,
+    NAMES,
+    NOT_DISPLACED_NATS,
+    PULSE_RAD,
+    features_of,
+    first_features,
+)
 from stages.geometry.frames import rotation_z
-from stages.kernels.detect.isolation import FREE_0, SECTORS
+from stages.kernels.detect.isolation import FREE_0, SECTORS, TALLY
 from tests.stages.detect.test_candidate import PLACE_M, candidate, observation, path
 
 TELEMETRY = tuple(NAMES[NAMES.index("over_static_nats") : NAMES.index("imu_over_static_nats")])
@@ -38,6 +46,25 @@ def test_after_one_observation_no_motion_is_known():
     unknown = {*MOTION, *TELEMETRY, *IMU, "passes_since_reacquired"}
     assert all(math.isnan(features[name]) for name in unknown)
     assert all(math.isfinite(features[name]) for name in set(NAMES) - unknown)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_the_features_of_a_first_observation_need_no_candidate(seed):
+    rng = np.random.default_rng(seed)
+    first = replace(
+        observation(0.0, returns=int(rng.integers(1, 9)), range_m=float(rng.uniform(2.0, 60.0))),
+        too_long=bool(rng.integers(2)),
+        round_chords=int(rng.integers(3)),
+        rough_chords=int(rng.integers(3)),
+        isolation=rng.integers(0, 4, TALLY).astype(np.int64) * rng.integers(0, 2, TALLY),
+        large_object_m=float(rng.choice([1.2, 3.9, math.inf])),
+    )
+    near_rejected, revisited, false_per_s = bool(rng.integers(2)), bool(rng.integers(2)), float(rng.uniform(0.1, 50.0))
+    c = candidate(first)
+    c.false_per_s, c.existence_nats = false_per_s, birth_nats(false_per_s)
+    c.near_rejected, c.revisited = near_rejected, revisited
+    alone = first_features(first, 0.5, false_per_s, near_rejected, revisited)
+    np.testing.assert_array_equal(alone, features_of(c, 0.5, True))
 
 
 def test_returns_are_relative_to_those_of_a_beam_across_the_drone():

@@ -2,8 +2,8 @@
 
 It selects the same floating-point kernels on every x86-64 processor with AVX2, so that a replay gives the same bits.
 OpenBLAS and numpy select theirs by the processor, and those for AVX-512 round differently: sums are in another order,
-and exp, log, sin and cos are other polynomials. OpenBLAS uses one thread: the order of its sums depends on their number,
-and on small matrices its threads wait for each other, on a busy machine for a hundred times as long as they compute.
+and exp, log, sin and cos are other polynomials. OpenBLAS uses one thread: the order of its sums depends on their
+number, and on a busy machine its threads wait for each other, on small matrices much longer than they compute.
 """
 
 from __future__ import annotations

@@ -669,7 +669,7 @@ def observation(t_s, xyz_m, free_sectors=SECTORS, returns=1):
 
 
 def near_a_rejected(away_m, after_s, parked=True):
-    """The candidate that appears next to an object that was rejected as a part of a large one."""
+    """The classification of one that appears next to an object that was rejected as a part of a large one."""
     stage = detector(parked=parked)
     part = observation(1.0, (0.0, 20.0, 20.0), free_sectors=0)
     stage._associate(stage._now, dataclasses.replace(part, large_object_m=1.0))
@@ -688,8 +688,8 @@ def test_near_a_recently_rejected_object_a_static_candidate_is_less_probable():
     ("parked", "memory_s"), [(True, NEAR_REJECTED_NS * 1e-9), (False, 0.05 * NEAR_REJECTED_NS * 1e-9)]
 )
 def test_a_rejected_position_is_forgotten_sooner_without_vehicle_motion(parked, memory_s):
-    assert near_a_rejected(1.0, memory_s - 0.1, parked).near_rejected
-    assert not near_a_rejected(1.0, memory_s + 0.1, parked).near_rejected
+    remembered, forgotten = near_a_rejected(1.0, memory_s - 0.1, parked), near_a_rejected(1.0, memory_s + 0.1, parked)
+    assert [c.features[NAMES.index("near_rejected")] for c in (remembered, forgotten)] == [1.0, 0.0]
 
 
 @pytest.mark.parametrize("alternative", Alternative)

@@ -274,7 +274,7 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
         return changed
 
     def _rejected_at_once(self, now: _State, s: Observation, features: Array64) -> bool:
-        """Reject a first observation that is not promising by its features; False: others or cues count, too."""
+        """Reject a first observation by its features. False: it is promising, or other candidates or cues count."""
         if now.cues.known or now.table.has_promising_since(s.stamp_ns):
             return False
         prediction = self._predict(features)

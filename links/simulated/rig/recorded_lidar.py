@@ -60,7 +60,7 @@ class RecordedLidar:
             where, there, here = difference
             raise LinkError(
                 f"{file} is of another flight: {where} is {there} in it, {here} now; record this one: grd simulate "
-                f"{scenario.name}.yaml -o {file} --duration {scenario.duration_s:g} --closed-loop CONFIG"
+                f"SCENARIO -o FILE --duration {scenario.duration_s:g} --closed-loop CONFIG"
             )
         self._file = file
         self._records = self._read()

@@ -42,10 +42,10 @@ class SimulatedMx28:
     """One servo. All times are nanoseconds of one monotonic clock."""
 
     def __init__(
-        self, settings: ServoSettings, seed: int, start_ns: int, firmware: int = 45, servo: Servo | None = None
+        self, settings: ServoSettings, seed: int, start_ns: int, firmware: int = 45, motor: Servo | None = None
     ) -> None:
-        """`servo`: another motor than that of the settings."""
-        self._servo = servo or Servo(settings)
+        """`motor`: another one than that of the settings."""
+        self._servo = motor or Servo(settings)
         self._gear_train = GearTrain(settings, seed)
         self._table = bytearray(mx28.TABLE_END)
         for register in mx28.REGISTERS:

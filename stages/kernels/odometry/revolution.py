@@ -26,15 +26,16 @@ class Poses(NamedTuple):
     lidar_vehicle_m: Array64  # (s, 3)
 
 
-class Columns(NamedTuple):
-    """c columns of k lasers by elevation."""
+class Revolution(NamedTuple):
+    """One revolution, columns c in order of firing, lasers k by elevation. Frame map, by the reported motion."""
 
     stamp_ns: NDArray[np.int64]  # (c, k)
-    xyz_m: Array64  # (c, k, 3) frame map
+    xyz_m: Array64  # (c, k, 3)
     range_m: Array64  # (c, k) 0: no return
     origin_m: Array64  # (c, 3)
     radial: Array64  # (c, 3) direction of a beam of elevation 0
     axis: Array64  # (c, 3) spin axis, towards higher elevations
+    step_rad: float  # turn of the rotor per column
 
 
 @compiled
@@ -62,7 +63,7 @@ def _unit(v: Array64) -> None:
 
 
 @compiled
-def columns_in_map(
+def revolution_in_map(
     direction_vehicle: NDArray[np.float32],
     range_m: NDArray[np.float32],
     stamp_ns: NDArray[np.int64],
@@ -71,11 +72,13 @@ def columns_in_map(
     used: NDArray[np.int64],
     shift: NDArray[np.int64],
     weights: Array64,
-) -> Columns:
-    """The columns of f firings of all lasers: directions (f, l, 3), ranges and times (f, l).
+    step_rad: float,
+) -> Revolution:
+    """The revolution by f firings of all lasers: directions (f, l, 3), ranges and times (f, l).
 
-    `begin` (s + 1,) are the slices' first firings and f. `used` (k,) are the lasers, `shift` (k,) their firings after
-    the column's, `weights` (2, k) give the radial direction and the axis from the directions of a column.
+    `begin` (s + 1,) are the slices' first firings and f. `used` (k,) are the lasers, `shift` (k,) their firings
+    after     the column's, `weights` (2, k) give the radial direction and the axis from the directions of a column,
+    `step_rad` is the     rotor's turn per column.
     """
     firings, k = len(range_m), len(used)
     R_map, origin_m = np.empty((firings, 3, 3)), np.empty((firings, 3))
@@ -97,4 +100,4 @@ def columns_in_map(
                 axis[c, i] += weights[1, n] * d
         _unit(radial[c])
         _unit(axis[c])
-    return Columns(stamps, points, ranges, origin_m[first : first + count], radial, axis)
+    return Revolution(stamps, points, ranges, origin_m[first : first + count], radial, axis, step_rad)

@@ -12,31 +12,18 @@ Image and Vision Computing 10(3), 1992.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stages.geometry.frames import Array64
 from stages.kernels.compiled import compiled
+from stages.kernels.odometry.revolution import Revolution
 
 ALONG = 3  # columns between a cell and its neighbours
 COPLANAR_M, ADJACENT_M = 0.05, 0.08  # of a cell and its neighbours along the rotor's motion, and of adjacent lasers
 GRAZING = 0.2  # smallest cosine between beam and normal
 NEAR_M, NEAR_SHARE = 0.6, 0.05  # distance between a point and its cell: and per metre of range
 LARGEST_M = 0.8  # distance from the plane
-
-
-class Revolution(NamedTuple):
-    """One revolution, columns c in order of firing, lasers k by elevation. Frame map, by the reported motion."""
-
-    stamp_ns: NDArray[np.int64]  # (c, k)
-    xyz_m: Array64  # (c, k, 3)
-    range_m: Array64  # (c, k) 0: no return
-    origin_m: Array64  # (c, 3)
-    radial: Array64  # (c, 3) direction of a beam of elevation 0
-    axis: Array64  # (c, 3) spin axis, towards higher elevations
-    step_rad: float  # turn of the rotor per column
 
 
 @compiled

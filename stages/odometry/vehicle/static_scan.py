@@ -26,8 +26,8 @@ import numpy as np
 
 from stages.geometry.frames import Array64
 from stages.geometry.rig_lidar import RigLidar
-from stages.kernels.odometry.revolution import Poses, columns_in_map
-from stages.kernels.odometry.scan_residuals import Revolution, scan_residuals
+from stages.kernels.odometry.revolution import Poses, Revolution, revolution_in_map
+from stages.kernels.odometry.scan_residuals import scan_residuals
 from stages.messages import SweptPulses
 
 LASERS, WIDTH_RAD = 16, math.radians(30.0)  # at most: 2 deg apart, so that the neighbours of a cell are on one surface
@@ -134,7 +134,7 @@ def revolution_of(fan: Fan, slices: list[PosedSlice], turned_rad: float) -> Revo
     ends = zip(*((*posed.first, *posed.last, np.array(posed.pulses.origin_vehicle_m)) for posed in slices), strict=True)
     step_rad = turned_rad / firings
     shift = np.rint(fan.azimuth_rad / step_rad).astype(np.int64)
-    columns = columns_in_map(
+    return revolution_in_map(
         direction.reshape(firings, fan.lasers, 3),
         range_m.reshape(firings, fan.lasers),
         stamp_ns.reshape(firings, fan.lasers),
@@ -143,8 +143,8 @@ def revolution_of(fan: Fan, slices: list[PosedSlice], turned_rad: float) -> Revo
         fan.used,
         shift,
         fan.weights,
+        step_rad,
     )
-    return Revolution(*columns, step_rad)
 
 
 def velocity_error(before: Revolution, now: Revolution, between_rad: Array64, forward: Array64) -> VelocityError | None:

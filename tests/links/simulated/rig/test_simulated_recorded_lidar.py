@@ -14,6 +14,7 @@ from links.lidar import Lidar
 from links.recording import RecordingReader
 from stages.messages import ServoGoal
 from tests.links.ports import free_ports
+from tests.links.simulated.rig.test_simulated_live_rig import SCENARIO as LIVE_SMALL
 
 pytest.importorskip("embreex", reason="simulating needs embreex: pip install -e '.[simulate]'")
 
@@ -25,17 +26,7 @@ from links.simulated.rig.scenario import load_scenario
 from links.simulated.sensors.servo import ServoSettings
 
 PATIENCE_S = 120.0
-SCENARIO = """\
-version: 1
-name: live_small
-start_utc: 2025-06-01T10:20:30Z
-duration_s: 4.0
-scene: {kind: open_lot}
-script: [{do: sweep, times: 2}]
-drone:
-  path: {waypoints: [{t_s: 0.0, xyz_m: [5.0, 2.0, 9.0]}]}
-vehicle_odometry: {}
-"""
+SCENARIO = LIVE_SMALL.replace("duration_s: 60.0", "duration_s: 4.0\nscript: [{do: sweep, times: 2}]")
 
 
 @pytest.fixture(scope="module")

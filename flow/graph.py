@@ -5,12 +5,12 @@
         use: stages.track.Track            # module.Class
         config: {radius_m: 0.8}            # the class's settings
         inputs: {points: sweep.swept_points}  # an edge; its queue in a live run: flow/config/edge.py
-        thread: lidar                      # live: stages that name one thread share it; default: a thread of its own
+        thread: lidar                      # live: stages and sources that name one share it; default: its own
         process: images                    # a worker process: flow/remote/stage_process.py, flow/subprocess_replay.py
         needs: $rig.cameras                # the stage is left out where the configuration has no such value
         low_priority: true                 # live: fewer images while other queues overflow: flow/live/backpressure.py
     links:
-      lidar: {use: links.lidar.Lidar}   # sources and sinks: use, config, inputs, needs
+      lidar: {use: links.lidar.Lidar}   # sources and sinks: use, config, inputs, needs, thread
 
 Source: ours.
 """
@@ -167,6 +167,12 @@ def _check_threads(tree: Tree, nodes: dict[str, NodeSpec]) -> None:
             other = low_priority[spec.thread].name
             text = f"'{other}' has low_priority and the same thread, '{spec.thread}': both would pause."
             tree.error(("stages", spec.name, "thread"), text)
+        if spec.kind == "links" and spec.thread and not (issubclass(spec.cls, Source) and spec.cls.polled):
+            text = "blocks, so it needs a thread of its own: leave 'thread' out, or write 'thread: null'."
+            tree.error(("links", spec.name, "thread"), text)
+        if spec.kind == "links" and spec.thread in low_priority:
+            text = f"'{low_priority[spec.thread].name}' has low_priority, so this source would pause with it."
+            tree.error(("links", spec.name, "thread"), text)
 
 
 def _check_processes(tree: Tree, graph: Graph) -> None:

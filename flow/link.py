@@ -5,11 +5,15 @@ Source: ours.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import select
+import threading
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 from typing_extensions import TypeVar
 
@@ -18,6 +22,9 @@ from flow.stage import Node, S, Settings
 
 TRUTH_TOPICS = "/truth"
 """Prefix of topics that hold the truth, for evaluation; no source may bring them in (`flow.graph` checks it)."""
+
+WAKE_S = 0.2
+"""Interval at which a source is asked for records, and a waiting thread checks whether it was closed."""
 
 RUN_TOPICS = "/run/"
 """Prefix of topics that a live run records about itself (`flow.live.input_order`); no source may bring them in."""
@@ -61,6 +68,53 @@ class SourceSettings(Settings):
     topic: str
 
 
+class Readable(Protocol):
+    """What `select` can wait for."""
+
+    def fileno(self) -> int:
+        """The file descriptor."""
+        ...
+
+
+class PolledRecords(ABC, Iterator[Record]):
+    """What `Source.listen` gives where nothing blocks but waiting for `files`.
+
+    The iterator waits. A thread that does other work too waits for `files`, at most `wait_s`, and takes `pending`.
+    """
+
+    def __init__(self) -> None:
+        self.closed = threading.Event()
+        """Set by any thread: the iterator ends within WAKE_S."""
+        self._arrived: deque[Record] = deque()
+
+    @property
+    def files(self) -> Sequence[Readable]:
+        """Readable when records have arrived; they may change."""
+        return ()
+
+    @property
+    def wait_s(self) -> float:
+        """The longest wait before `pending` must be called."""
+        return WAKE_S
+
+    @abstractmethod
+    def pending(self) -> Iterable[Record]:
+        """Records that have arrived, without waiting; more may be left. LinkError: the source has failed."""
+
+    def __next__(self) -> Record:
+        while not self._arrived:
+            if self.closed.is_set():
+                raise StopIteration
+            try:
+                select.select(self.files, [], [], self.wait_s)
+                self._arrived.extend(self.pending())
+            except (OSError, ValueError, LinkError):  # a file is closed by another thread
+                if self.closed.is_set():
+                    raise StopIteration from None
+                raise
+        return self._arrived.popleft()
+
+
 SourceS = TypeVar("SourceS", bound=SourceSettings, default=SourceSettings, covariant=True)
 
 
@@ -73,6 +127,7 @@ class Source(Link[SourceS]):
     """
 
     silent_after_s: ClassVar[float | None] = None  # a source that has sent records and then none for so long has failed
+    polled: ClassVar[bool] = False  # `listen` gives PolledRecords: live it can share a thread with stages
 
     @property
     def topic(self) -> str:

@@ -19,7 +19,7 @@ from flow.stage import Node
 
 NODE_KEYS = {
     "stages": ("use", "config", "inputs", "needs", "thread", "process", "low_priority"),
-    "links": ("use", "config", "inputs", "needs"),
+    "links": ("use", "config", "inputs", "needs", "thread"),
 }
 _NAME = re.compile(r"[a-z][a-z0-9_]*\Z")
 NEEDED = r"^\$[^\s$]+$"  # a reference without a default
@@ -34,7 +34,7 @@ class NodeSpec:
     use: str  # import path as declared
     cls: type[Node[Any]]
     config: dict[str, Any]
-    thread: str = ""  # of a stage in a live run; stages of one name share it
+    thread: str = ""  # in a live run; stages and sources of one name share it; empty: a link's own
     process: str = ""  # of a stage, the worker process; stages of one name share it; empty: the run's own process
     low_priority: bool = False  # of a stage in a live run: it takes fewer images while others do not keep up
 
@@ -105,7 +105,7 @@ def _check_keys(tree: Tree, path: KeyPath, declared: dict[str, Any]) -> None:
 def _thread(tree: Tree, path: KeyPath, declared: dict[str, Any]) -> str:
     thread: Any = declared.get("thread")
     if thread is None:
-        return path[1]
+        return path[1] if path[0] == "stages" else ""
     if not (isinstance(thread, str) and _NAME.match(thread)):
         tree.error((*path, "thread"), f"must be a name as stages have, got {thread!r}.")
     return str(thread)

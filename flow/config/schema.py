@@ -49,7 +49,7 @@ _INCLUDES = [{"type": "string"}, _COPY]
 _EDGE = {"$ref": "#/$defs/edge"}
 _THREAD = {
     "type": ["string", "null"],
-    "description": "live: stages that name one thread share it; null (default): a thread for each",
+    "description": "live: stages and sources that name one thread share it; null (default): a thread for each",
 }
 _PROCESS = {
     "type": ["string", "null"],
@@ -61,7 +61,7 @@ _NEEDS = {
     "pattern": NEEDED,
     "description": "the node is left out where the configuration has no such value, as in $rig.cameras",
 }
-_OF_STAGES = {"thread": _THREAD, "process": _PROCESS, "low_priority": _LOW_PRIORITY}
+_OF_STAGES = {"process": _PROCESS, "low_priority": _LOW_PRIORITY}
 
 
 def schema() -> dict[str, Any]:
@@ -96,6 +96,7 @@ def _section(kind: str, definitions: dict[str, Any]) -> dict[str, Any]:
             "config": {"type": "object"},
             "inputs": {"type": "object", "additionalProperties": _EDGE},
             "needs": _NEEDS,
+            "thread": _THREAD,
             **(_OF_STAGES if kind == "stages" else {}),
         },
         "allOf": [

@@ -7,13 +7,18 @@ Source: ours.
 
 from __future__ import annotations
 
+import select
+import socket
 import threading
 from collections import deque
 from collections.abc import Sequence
 from typing import NamedTuple
 
 from flow.config.edge import QueueSettings
+from flow.link import Readable
 from flow.message import Message
+
+WAKEUP_BYTES = 4096  # more than are ever waiting
 
 
 class Item(NamedTuple):
@@ -31,14 +36,61 @@ class Wakeup:
 
     def __init__(self) -> None:
         self.changed = threading.Condition()
-        self.someone_waits = False
+        self._someone_waits = False
 
     def wait(self, inboxes: Sequence[Inbox], timeout_s: float) -> None:
         """Wait until one of the inboxes has a message or is closed, at most `timeout_s`."""
         with self.changed:
-            self.someone_waits = True
+            self._someone_waits = True
             self.changed.wait_for(lambda: any(inbox.has_work for inbox in inboxes), timeout_s)
-            self.someone_waits = False
+            self._someone_waits = False
+
+    def notify(self) -> None:
+        """A message has arrived, or an inbox has closed. `changed` is held."""
+        if self._someone_waits:
+            self.changed.notify_all()
+
+
+class PolledWakeup(Wakeup):
+    """A wakeup of a thread that waits for files too."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._receiver, self._sender = socket.socketpair()
+        self._receiver.setblocking(False)
+        self._sender.setblocking(False)
+        self._woken = False
+
+    def wait_for_files(self, inboxes: Sequence[Inbox], files: Sequence[Readable], timeout_s: float) -> list[Readable]:
+        """Wait for one of the inboxes or of the files; those files that are readable."""
+        with self.changed:
+            waits = timeout_s > 0.0 and not self._woken and not any(inbox.has_work for inbox in inboxes)
+            self._someone_waits, self._woken = waits, False
+        ready, _, _ = select.select([self._receiver, *files], [], [], timeout_s if waits else 0.0)
+        with self.changed:
+            self._someone_waits = False
+        if self._receiver in ready:
+            self._receiver.recv(WAKEUP_BYTES)
+        return ready
+
+    def notify(self) -> None:
+        """See Wakeup."""
+        if self._someone_waits:
+            self._someone_waits = False
+            self._sender.send(b"\0")
+
+    def wake(self) -> None:
+        """End the wait, or the next one."""
+        with self.changed:
+            self._woken = True
+            self.notify()
+
+    def close(self) -> None:
+        """End it with its thread."""
+        with self.changed:
+            self._someone_waits = False
+            self._receiver.close()
+            self._sender.close()
 
 
 class Inbox:
@@ -67,8 +119,7 @@ class Inbox:
                 self.dropped[port] += 1
             queue.append(Item(self._order, port, number, arrival_ns, message))
             self._order += 1
-            if self.wakeup.someone_waits:
-                self._changed.notify_all()
+            self.wakeup.notify()
 
     def take(self) -> Item | None:
         """The queued message that was put first; None: no message is queued."""
@@ -95,7 +146,7 @@ class Inbox:
         """Drop whatever is put from now on; queued messages can still be taken."""
         with self._changed:
             self._closed = True
-            self._changed.notify_all()
+            self.wakeup.notify()
 
     def clear(self) -> None:
         """Drop all queued messages."""
@@ -103,7 +154,7 @@ class Inbox:
             for port, queue in enumerate(self._ports):
                 self.dropped[port] += len(queue)
                 queue.clear()
-            self._changed.notify_all()
+            self.wakeup.notify()
 
     @property
     def has_work(self) -> bool:

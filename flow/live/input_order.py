@@ -25,7 +25,7 @@ from flow.link import RUN_TOPICS, LinkError, Record
 
 ORDER_TOPIC = RUN_TOPICS + "order"
 END_TOPIC = RUN_TOPICS + "end"
-"""Topic of one record, JSON {"output_hash"}: the live run's hash, written when the run has stopped."""
+"""Topic of one record, JSON {"output_hash"}: the live run's hash (null: not computed), written when it has stopped."""
 FINISH = "finish"
 MAX_BITS = 63  # of a number
 MAX_RECORD_BYTES = 4 * 2**20  # a stage that takes 10 000 messages a second for minutes

@@ -2,8 +2,9 @@
 
 - One thread for each source listens, decodes and publishes. Each stage, sink and tap has an inbox (`flow.config.edge`:
   its queues) and a thread.
-- Stages that do little for each of many messages share a thread (`thread: NAME`). Python runs one thread at a time,
-  and switching threads for each packet would cost as much as the work.
+- Stages that do little for each of many messages share a thread (`thread: NAME`), and sources that need not block share
+  it too (`flow.live.shared_thread`). Python runs one thread at a time, and switching threads for each packet would cost
+  as much as the work.
 - Stages that do much for each of few messages may run in a worker process (`process: NAME`,
   `flow.remote.stage_process`).
 
@@ -84,20 +85,27 @@ class Live:
         sys.setswitchinterval(SWITCH_S)
         threads = self._wiring
         threads.processes.wait()
-        for thread in (*threads.taps, *threads.sinks, *threads.stage_threads, *threads.sources, self._housekeeper):
+        runs = (*threads.taps, *threads.sinks, *threads.stage_threads, *threads.source_threads)
+        for thread in (*runs, self._housekeeper):
             thread.start()
 
     def stop(self) -> LiveReport:
         """End the run in less than 2 s: links close, stages and sinks take their queues, stages finish. The report."""
         threads = self._wiring
         self._shared.stopping.set()
+        for thread in threads.shared_threads:
+            thread.wake()
+        listening = threads.source_threads
         closers = [
-            threading.Thread(target=source.close, name=f"close {source.node}", daemon=True)
-            for source in threads.sources
+            threading.Thread(target=thread.source.close, name=f"close {thread.source.node}", daemon=True)
+            for thread in listening
         ]
         for closer in closers:
             closer.start()
-        self._join([*closers, *threads.sources], CLOSE_S)
+        deadline_s = time.monotonic() + CLOSE_S
+        self._join([*closers, *listening], CLOSE_S)
+        for source in threads.sources:
+            source.ended.wait(max(0.0, deadline_s - time.monotonic()))
         deadline_s = time.monotonic() + DRAIN_S
         for worker in (*threads.stages, *threads.sinks):
             worker.inbox.close()
@@ -148,10 +156,9 @@ class Live:
                 self._shared.record(record)
 
     def _record_end(self) -> None:
-        if self._shared.digest is not None:
-            now_ns = self._shared.now_ns()
-            data = json.dumps({"output_hash": self._shared.digest.hexdigest()}).encode()
-            self._shared.record(Record(END_TOPIC, now_ns, now_ns, data))
+        digest, now_ns = self._shared.digest, self._shared.now_ns()
+        data = json.dumps({"output_hash": None if digest is None else digest.hexdigest()}).encode()
+        self._shared.record(Record(END_TOPIC, now_ns, now_ns, data))
 
     def report(self) -> LiveReport:
         """The run so far."""

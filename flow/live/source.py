@@ -1,4 +1,4 @@
-"""The thread of a source in a live run: it listens, records, decodes and publishes, and reopens a link that fails.
+"""A source in a live run: it listens, records, decodes and publishes, and reopens a link that fails.
 
 Source: ours.
 """
@@ -8,11 +8,11 @@ from __future__ import annotations
 import dataclasses
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager
 from time import perf_counter_ns
 
-from flow.link import LinkError, Record, Source
+from flow.link import LinkError, PolledRecords, Readable, Record, Source
 from flow.live.report import LinkReport, LinkState
 from flow.live.threads import Feed, RunThread, Shared
 from flow.message import Message
@@ -22,37 +22,33 @@ from flow.ports import Output, RunError, decoded, named
 FIRST_PAUSE_S, MAX_PAUSE_S = 0.5, 8.0  # before a link is reopened; it doubles each time
 
 
-class SourceThread(RunThread):
-    """Listens to one source."""
+class SourceRun:
+    """A source through all its openings: what is done with its records, and with its failures."""
 
     def __init__(self, name: str, source: Source, outputs: dict[type[Message], Output[Feed]], shared: Shared) -> None:
-        super().__init__(f"listen {name}", shared)
-        self.node, self.source = name, source
+        self.node, self.source, self.shared = name, source, shared
         self.compute = Latency()
         self.report = LinkReport()
         self.first_ns = self.last_ns = 0
+        self.ended = threading.Event()
         self._outputs = outputs
+        self._topics = source.replay_topics
+        self._pause_s, self._records_before = FIRST_PAUSE_S, 0
         self._last_change = 0, 0.0  # number of records, and the time [s] when `silence` first found that number
         self._lock = threading.Lock()
         self._opened: AbstractContextManager[Iterator[Record]] | None = None
 
-    def run(self) -> None:
-        stopping, pause_s = self.shared.stopping, FIRST_PAUSE_S
-        while not stopping.is_set():
-            records_before = self.report.records
-            try:
-                self._listen()
-                reason = "its records have ended"
-            except (LinkError, RunError) as error:
-                reason = str(error)
-            if stopping.is_set():
-                break
-            self.report.reason = reason
-            self.report.state = LinkState.FAILED
-            pause_s = FIRST_PAUSE_S if self.report.records > records_before else min(2 * pause_s, MAX_PAUSE_S)
-            self.shared.events.report(self.node, f"{reason}; it is reopened")
-            stopping.wait(pause_s)
-        self.report.state = LinkState.CLOSED
+    def open(self) -> Iterator[Record]:
+        """Open the link. LinkError: it cannot be opened."""
+        self._records_before = self.report.records
+        opened = self.source.listen()
+        records = opened.__enter__()
+        with self._lock:
+            self._opened = opened
+        self.report.openings += 1
+        if self.report.openings == 1:
+            self.report.state = LinkState.OPEN
+        return records
 
     def close(self) -> None:
         """End the listening, from any thread."""
@@ -60,6 +56,22 @@ class SourceThread(RunThread):
             opened, self._opened = self._opened, None
         if opened is not None:
             opened.__exit__(None, None, None)
+
+    def failed(self, reason: str) -> float:
+        """Report a link that has failed, unless the run stops; the pause before it is reopened [s]."""
+        if self.shared.stopping.is_set():
+            return 0.0
+        self.report.reason = reason
+        self.report.state = LinkState.FAILED
+        gave_records = self.report.records > self._records_before
+        self._pause_s = FIRST_PAUSE_S if gave_records else min(2 * self._pause_s, MAX_PAUSE_S)
+        self.shared.events.report(self.node, f"{reason}; it is reopened")
+        return self._pause_s
+
+    def end(self) -> None:
+        """The run stops."""
+        self.report.state = LinkState.CLOSED
+        self.ended.set()
 
     def silence(self) -> str | None:
         """A text when the source has sent records and then none for `silent_after_s`. One thread calls it regularly."""
@@ -75,27 +87,8 @@ class SourceThread(RunThread):
             return None
         return f"has sent nothing for {after_s:g} s: is it powered, and its cable plugged in?"
 
-    def _listen(self) -> None:
-        """From opening to the end of the records. LinkError, or RunError for what no link should raise."""
-        with named(f"{self.node}.listen"):
-            opened = self.source.listen()
-            records = opened.__enter__()
-            with self._lock:
-                self._opened = opened
-            self.report.openings += 1
-            if self.report.openings == 1:
-                self.report.state = LinkState.OPEN
-            try:
-                if self.shared.stopping.is_set():  # `close` came too early to close it
-                    return
-                for record in records:
-                    if self.shared.stopping.is_set():
-                        return
-                    self._take(record)
-            finally:
-                self.close()
-
-    def _take(self, record: Record) -> None:
+    def take(self, record: Record) -> None:
+        """Record it, decode it, and publish its messages."""
         if self.report.state is not LinkState.OPEN:
             self.report.state = LinkState.OPEN
             self.shared.events.report(self.node, "records arrive again", resolved=True)
@@ -104,7 +97,7 @@ class SourceThread(RunThread):
         self.first_ns, self.last_ns = self.first_ns or record.arrival_ns, record.arrival_ns
         self.report.records += 1
         self.shared.record(record)
-        if record.topic != self.source.topic:
+        if record.topic not in self._topics:
             return
         begin = perf_counter_ns()
         try:
@@ -114,3 +107,83 @@ class SourceThread(RunThread):
             self.report.undecoded += 1
             self.shared.events.report(self.node, str(error))
         self.compute.add(perf_counter_ns() - begin)
+
+
+class SourceThread(RunThread):
+    """Listens to one source, which may block."""
+
+    def __init__(self, source: SourceRun, shared: Shared) -> None:
+        super().__init__(f"listen {source.node}", shared)
+        self.source = source
+
+    def run(self) -> None:
+        stopping = self.shared.stopping
+        while not stopping.is_set():
+            try:
+                self._listen()
+                reason = "its records have ended"
+            except (LinkError, RunError) as error:
+                reason = str(error)
+            stopping.wait(self.source.failed(reason))
+        self.source.end()
+
+    def _listen(self) -> None:
+        """From opening to the end of the records. LinkError, or RunError for what no link should raise."""
+        with named(f"{self.source.node}.listen"):
+            records = self.source.open()
+            try:
+                if self.shared.stopping.is_set():  # `close` came too early to close it
+                    return
+                for record in records:
+                    if self.shared.stopping.is_set():
+                        return
+                    self.source.take(record)
+            finally:
+                self.source.close()
+
+
+class PolledSource:
+    """Listens to one source (`Source.polled`) in a thread that does other work too, one `step` after another."""
+
+    def __init__(self, source: SourceRun) -> None:
+        self.source = source
+        self._records: PolledRecords | None = None
+        self._due_s = 0.0  # of the next step, monotonic
+
+    @property
+    def files(self) -> Sequence[Readable]:
+        """A step is due when one of these is readable."""
+        return () if self._records is None else self._records.files
+
+    @property
+    def due_s(self) -> float:
+        """A step is due at this time, monotonic."""
+        return self._due_s
+
+    def step(self) -> None:
+        """Take what has arrived; open the link first if it is closed."""
+        try:
+            with named(f"{self.source.node}.listen"):
+                if self._records is None:
+                    records = self.source.open()
+                    assert isinstance(records, PolledRecords), "`polled` sources give PolledRecords"
+                    self._records = records
+                for record in self._records.pending():
+                    self.source.take(record)
+                self._due_s = time.monotonic() + self._records.wait_s
+        except (LinkError, RunError) as error:
+            self._close()
+            self._due_s = time.monotonic() + self.source.failed(str(error))
+
+    def end(self) -> None:
+        """The run stops."""
+        self._close()
+        self.source.end()
+
+    def _close(self) -> None:
+        self._records = None
+        try:
+            with named(f"{self.source.node}.close"):
+                self.source.close()
+        except (LinkError, RunError) as error:
+            self.source.shared.events.report(self.source.node, str(error))

@@ -129,25 +129,29 @@ class StageThread(RunThread):
         """`stages`: producers before consumers, all with this wakeup. `throttle`: of stages with low priority."""
         super().__init__(f"stage {name}", shared)
         self.stages, self._wakeup, self._throttle = stages, wakeup, throttle
+        self._inboxes = [stage.inbox for stage in stages]
+        self._running = stages[::-1]
 
     def run(self) -> None:
-        inboxes = [stage.inbox for stage in self.stages]
-        running = self.stages[::-1]
-        while running:
-            for stage in running:
-                item = stage.inbox.take()
-                if item is not None:
-                    stage.take(item)
-                    if self._throttle is not None and stage.takes_newest(item.port):
-                        self._pause(stage.stage.name, self._throttle)
-                    break
-                if stage.inbox.done:
-                    if not stage.ended.is_set():
-                        stage.end()
-                    running = [other for other in running if other is not stage]
-                    break
-            else:
-                self._wakeup.wait(inboxes, WAIT_S)
+        while self._running:
+            if not self.step():
+                self._wakeup.wait(self._inboxes, WAIT_S)
+
+    def step(self) -> bool:
+        """One message of one stage. False: no message is queued."""
+        for stage in self._running:
+            item = stage.inbox.take()
+            if item is not None:
+                stage.take(item)
+                if self._throttle is not None and stage.takes_newest(item.port):
+                    self._pause(stage.stage.name, self._throttle)
+                return True
+            if stage.inbox.done:
+                if not stage.ended.is_set():
+                    stage.end()
+                self._running = [other for other in self._running if other is not stage]
+                return True
+        return False
 
     def _pause(self, stage: str, throttle: Throttle) -> None:
         """After an image, for as long as other stages need it."""

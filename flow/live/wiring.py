@@ -14,10 +14,11 @@ from flow.events import EventMessage
 from flow.graph import Graph
 from flow.link import Link, Source, Tap
 from flow.live.backpressure import MonitoredQueue, Throttle
-from flow.live.inbox import Inbox, Wakeup
+from flow.live.inbox import Inbox, PolledWakeup, Wakeup
 from flow.live.input_order import OrderLog
 from flow.live.report import EdgeCount, EdgeReport, EdgeStatus, edge_report
-from flow.live.source import SourceThread
+from flow.live.shared_thread import SharedThread
+from flow.live.source import SourceRun, SourceThread
 from flow.live.supervised_stage import SupervisedStage
 from flow.live.threads import Feed, Shared, SinkThread, StageRun, StageThread, TapThread
 from flow.message import Message
@@ -68,9 +69,11 @@ class Wiring:
     """All threads of a run, not yet started, and what connects them."""
 
     def __init__(self, graph: Graph, taps: Sequence[Tap], shared: Shared) -> None:
-        self.sources: list[SourceThread] = []
+        self.sources: list[SourceRun] = []
+        self.source_threads: list[SourceThread] = []
         self.stages: list[StageRun] = []  # producers before consumers
         self.stage_threads: list[StageThread] = []
+        self.shared_threads: list[SharedThread] = []  # of stages and sources
         self.sinks: list[SinkThread] = []
         self.taps: list[TapThread] = []
         self.orders: list[OrderLog] = []
@@ -80,7 +83,8 @@ class Wiring:
         self.processes = Processes()
         self._events: Output[Feed] = Output("run.events", [])
         self._shared = shared
-        self._wakeups: dict[str, Wakeup] = {}  # by thread
+        with_sources = {spec.thread for spec in graph.nodes.values() if spec.kind == "links" and spec.thread}
+        self._wakeups: dict[str, Wakeup] = {thread: PolledWakeup() for thread in with_sources}
         for spec in graph.nodes.values():
             outputs = output_ports(spec.cls)
             self.outputs[spec.name] = {message: Output(f"{spec.name}.{name}", []) for name, message in outputs.items()}
@@ -91,8 +95,13 @@ class Wiring:
         queues = [edge.queue() for edge in self.edges.values() if edge.is_monitored(graph)]
         for thread, wakeup in self._wakeups.items():
             runs = [run for run in self.stages if thread_of[run.stage.name] == thread]
-            throttle = Throttle(queues) if thread in throttled else None
-            self.stage_threads.append(StageThread(thread, runs, wakeup, shared, throttle))
+            if isinstance(wakeup, PolledWakeup):
+                sources = [source for source in self.sources if thread_of[source.node] == thread]
+                self.shared_threads.append(SharedThread(thread, runs, sources, wakeup, shared))
+            else:
+                throttle = Throttle(queues) if thread in throttled else None
+                self.stage_threads.append(StageThread(thread, runs, wakeup, shared, throttle))
+        self.stage_threads += self.shared_threads
         for tap in taps:
             self.links[type(tap).__name__.lower()] = tap
             self._add_tap(tap)
@@ -145,7 +154,9 @@ class Wiring:
             if type(link).listen is Source.listen:
                 shared.events.report(spec.name, f"{type(link).__name__} cannot run live: it gives nothing")
             else:
-                self.sources.append(SourceThread(spec.name, link, self.outputs[spec.name], shared))
+                self.sources.append(SourceRun(spec.name, link, self.outputs[spec.name], shared))
+                if not spec.thread:
+                    self.source_threads.append(SourceThread(self.sources[-1], shared))
         if counts or type(link).sent is not Link.sent:
             self.sinks.append(SinkThread(spec.name, link, inbox, counts, shared))
 

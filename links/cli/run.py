@@ -78,6 +78,10 @@ def run(
             "--warm-up/--no-warm-up", help="Live: replay a recording first, so that all kernels are compiled."
         ),
     ] = True,
+    hashed: Annotated[
+        bool,
+        typer.Option("--hash", help="Live: compute the output hash, so that grd replay --as-live can compare it."),
+    ] = False,
     hosts: HostsFile = None,
     host: HostName = None,
     against: Annotated[
@@ -115,7 +119,7 @@ def run(
     if against is not None:
         raise LinkError(f"--against is for a configuration that replays a recording, and {config} runs live")
     request = RunRequest(config, tuple(overlay or ()), tuple(sets or ()))
-    _run_live(request, _new_folder(out_dir, f"live-{config.stem}"), for_s, warm, place, view)
+    _run_live(request, _new_folder(out_dir, f"live-{config.stem}"), for_s, warm, hashed, place, view)
 
 
 @report_errors
@@ -192,7 +196,13 @@ def _replay_all(
 
 
 def _run_live(
-    request: RunRequest, folder: Path, for_s: float | None, warm: bool, place: tuple[Path, str] | None, view: bool
+    request: RunRequest,
+    folder: Path,
+    for_s: float | None,
+    warm: bool,
+    hashed: bool,
+    place: tuple[Path, str] | None,
+    view: bool,
 ) -> None:
     """Run live; `place`: the file of hosts and the name of this one."""
     err.print(f"loading {request.config}", markup=False)
@@ -212,7 +222,7 @@ def _run_live(
         if not_warm:
             warn(not_warm)
     with LiveView() as view_of_run:
-        result = run_live(folder, request, graph, view_of_run.show, for_s, (view_of_run.latest,))
+        result = run_live(folder, request, graph, view_of_run.show, for_s, (view_of_run.latest,), hashed=hashed)
     print_result(result)
     if view:
         _open_viewer(result.out_dir)

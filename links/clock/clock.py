@@ -9,14 +9,13 @@ Source: ours; `links.clock.host_time` (a step of the wall clock moves no tick).
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, ClassVar
 
 from pydantic import Field
 
-from flow.link import Record, Source, SourceSettings
+from flow.link import WAKE_S, PolledRecords, Record, Source, SourceSettings
 from links.clock import host_time
 from stages.messages import Tick
 
@@ -30,6 +29,8 @@ class ClockSettings(SourceSettings):
 
 class Clock(Source[ClockSettings]):
     """Ticks at `rate_hz`."""
+
+    polled: ClassVar[bool] = True
 
     def __init__(self, settings: ClockSettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
@@ -45,23 +46,38 @@ class Clock(Source[ClockSettings]):
         return Tick(stamp_ns=record.stamp_ns)
 
     @contextmanager
-    def listen(self) -> Iterator[Iterator[Record]]:
+    def listen(self) -> Iterator[PolledRecords]:
         """Ticks from now on: `with clock.listen() as records`."""
-        closed = threading.Event()
+        ticks = Ticks(self.settings, self._count_missed)
         try:
-            yield self._ticks(closed)
+            yield ticks
         finally:
-            closed.set()
+            ticks.closed.set()
 
-    def _ticks(self, closed: threading.Event) -> Iterator[Record]:
-        period_ns = round(1e9 / self.settings.rate_hz)
-        due_ns = (host_time.now_ns() // period_ns + 1) * period_ns
-        while not closed.wait(max(0, due_ns - host_time.now_ns()) * 1e-9):
-            now_ns = host_time.now_ns()
-            if now_ns < due_ns:
-                continue
-            missed = (now_ns - due_ns) // period_ns
-            self._missed += missed
-            due_ns += missed * period_ns
-            yield Record(self.settings.topic, now_ns, due_ns, b"")
-            due_ns += period_ns
+    def _count_missed(self, ticks: int) -> None:
+        self._missed += ticks
+
+
+class Ticks(PolledRecords):
+    """Records of the ticks from now on."""
+
+    def __init__(self, settings: ClockSettings, on_missed: Callable[[int], None]) -> None:
+        super().__init__()
+        self._topic, self._period_ns, self._on_missed = settings.topic, round(1e9 / settings.rate_hz), on_missed
+        self._due_ns = (host_time.now_ns() // self._period_ns + 1) * self._period_ns
+
+    @property
+    def wait_s(self) -> float:
+        """See PolledRecords."""
+        return min(max(0, self._due_ns - host_time.now_ns()) * 1e-9, WAKE_S)
+
+    def pending(self) -> list[Record]:
+        """See PolledRecords."""
+        now_ns = host_time.now_ns()
+        if now_ns < self._due_ns:
+            return []
+        missed = (now_ns - self._due_ns) // self._period_ns
+        self._on_missed(missed)
+        stamp_ns = self._due_ns + missed * self._period_ns
+        self._due_ns = stamp_ns + self._period_ns
+        return [Record(self._topic, now_ns, stamp_ns, b"")]

@@ -7,14 +7,13 @@ Source: recording format in recordings/README.md (/cues).
 
 from __future__ import annotations
 
-import dataclasses
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from typing import Any, ClassVar
 
 from flow.counters import Counters
-from flow.link import Record, Source
+from flow.link import PolledRecords, Record, Source
 from links.cues.parsing import CueParser
 from links.udp import UdpSettings, listen_udp
 from stages.messages import DroneGnss, UwbRange, VehicleGnss
@@ -34,6 +33,8 @@ class CuesSettings(UdpSettings):
 class Cues(Source[CuesSettings]):
     """GNSS of the vehicle and of the drone, ranges. What is invalid is counted with its reason and skipped."""
 
+    polled: ClassVar[bool] = True
+
     def __init__(self, settings: CuesSettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
         self._parser = CueParser()
@@ -51,11 +52,13 @@ class Cues(Source[CuesSettings]):
         """See Source."""
         return self.settings.topic, self.settings.topic + NMEA_SUFFIX
 
-    @contextmanager
-    def listen(self) -> Iterator[Iterator[Record]]:
+    def listen(self) -> AbstractContextManager[PolledRecords]:
         """Receive cues: `with cues.listen() as records`. LinkError without `port`, or when it cannot be opened."""
-        with listen_udp(self.settings, self._udp) as records:
-            yield (_on_its_topic(record) for record in records)
+        return listen_udp(self.settings, self._udp, self._topic_of)
+
+    def _topic_of(self, data: bytes) -> str:
+        is_nmea = data.lstrip().startswith(b"$")
+        return self.settings.topic + NMEA_SUFFIX if is_nmea else self.settings.topic
 
     def decode(self, record: Record) -> Iterator[VehicleGnss | DroneGnss | UwbRange]:
         """The valid cues of one datagram."""
@@ -65,8 +68,3 @@ class Cues(Source[CuesSettings]):
             self._rejected[reason if known else "other reasons"] += 1
         self._decoded += len(found)
         yield from found
-
-
-def _on_its_topic(record: Record) -> Record:
-    is_nmea = record.data.lstrip().startswith(b"$")
-    return dataclasses.replace(record, topic=record.topic + NMEA_SUFFIX) if is_nmea else record

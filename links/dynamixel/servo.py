@@ -12,8 +12,6 @@ from __future__ import annotations
 
 import json
 import math
-import threading
-import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -23,8 +21,7 @@ from typing import Any, ClassVar, Literal
 from pydantic import Field, model_validator
 
 from flow.counters import Counters
-from flow.link import LinkError, Record, Source, SourceSettings
-from links.clock import host_time
+from flow.link import PolledRecords, Record, Source, SourceSettings
 from links.dynamixel import wire
 from links.dynamixel.drive import DriveSettings
 from links.dynamixel.mx28 import (
@@ -35,12 +32,10 @@ from links.dynamixel.mx28 import (
     VELOCITY_UNIT_RPM,
     named_errors,
 )
-from links.dynamixel.servo_process import ProcessEnded, ServoProcess
+from links.dynamixel.readings import Readings, ServoHealth
 from stages.messages import ServoGoal, ServoState
 
 MAX_STATE_BYTES = 1_000
-WAKE_S = 0.2  # how often a waiting listener checks whether it was closed
-RESTART_S, MAX_STARTS = 0.1, 4  # pause before a restart of the process, times its number; starts without a reading
 
 Baud = Literal[57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000]
 
@@ -99,17 +94,15 @@ class Servo(Source[ServoSettings]):
     silent_after_s: ClassVar[float | None] = (
         2.0  # the process recovers from faults by itself, without records meanwhile
     )
+    polled: ClassVar[bool] = True
 
     def __init__(self, settings: ServoSettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
         self._counts: Counter[str] = Counter()
         self._rejected: int = 0
         self._pending: GoalCommand | None = None
-        self._process: ServoProcess | None = None
-        self._lock = threading.Lock()  # for replacing the process
-        self._ended: Counter[str] = Counter()  # totals of processes that have ended
-        self._health: wire.Health | None = None
-        self._error: int = 0  # newest Hardware Error Status
+        self._readings: Readings | None = None
+        self._health = ServoHealth()
 
     @property
     def rejected(self) -> int:
@@ -119,11 +112,7 @@ class Servo(Source[ServoSettings]):
     @property
     def counters(self) -> Counters:
         """Totals since the start, and the newest `connected`, voltage and temperature."""
-        now = {} if self._health is None else self._health._asdict()
-        totals = {name: now.get(name, 0) + self._ended[name] for name in TOTALS} | {
-            name: now.get(name, 0) for name in STATES
-        }
-        own = dict(self._counts)
+        totals, own = self._health.counters, dict(self._counts)
         totals = {**totals, **own, "goals_lost": totals["goals_lost"] + own.get("goals_lost", 0)}
         return Counters(totals, {"no servo state": self._rejected})
 
@@ -131,14 +120,12 @@ class Servo(Source[ServoSettings]):
     def status(self) -> str | None:
         """See Link: that the servo has shut down or does not reply, after it had been set up."""
         health = self._health
-        if self._process is None or health is None or health.connected:
+        if self._readings is None or not health.is_lost:
             return None
-        if not self._ended["set_ups"] + health.set_ups:  # not set up yet
-            return None
-        why = f"has shut down ({named_errors(self._error)})" if self._error else "does not reply, or lost its setup"
+        why = f"has shut down ({named_errors(health.error)})" if health.error else "does not reply, or lost its setup"
         action = (
             "it is set up again automatically"
-            if self.settings.reboot or not self._error
+            if self.settings.reboot or not health.error
             else "it needs a reboot (`reboot: false`)"
         )
         return f"the servo {why} and does not move: {action}; check its supply, its cable, and the load on its axis"
@@ -153,22 +140,22 @@ class Servo(Source[ServoSettings]):
 
     def on_goal(self, goal: ServoGoal) -> None:
         """Live: send a goal at once, clamped to the limits. Otherwise keep the newest for `take_command`."""
-        process = self._process
-        if process is None:
+        readings = self._readings
+        if readings is None:
             self._pending = goal_command(goal)
             self._counts[NOT_LIVE] += 1
         elif not (math.isfinite(goal.position_rad) and math.isfinite(goal.speed_radps)):
             self._counts["goals rejected: not finite"] += 1
-        elif not process.send(self._within_limits(goal)):
+        elif not readings.send(self._within_limits(goal)):
             self._counts["goals_lost"] += 1
 
     def upstream_lost(self, port: str) -> str | None:
         """See Link: the aim stage has stopped; stop the servo instead of finishing its travel."""
-        process = self._process
-        if process is None:
+        readings = self._readings
+        if readings is None:
             return None
         self._counts["stops: no aim stage"] += 1
-        return "the servo is stopped" if process.send(wire.Stop()) else "the servo could not be stopped"
+        return "the servo is stopped" if readings.send(wire.Stop()) else "the servo could not be stopped"
 
     def take_command(self) -> GoalCommand | None:
         """The newest goal that was not taken yet; None: none."""
@@ -176,64 +163,18 @@ class Servo(Source[ServoSettings]):
         return command
 
     @contextmanager
-    def listen(self) -> Iterator[Iterator[Record]]:
+    def listen(self) -> Iterator[PolledRecords]:
         """Start the servo process: `with servo.listen() as records`; the end of the context stops the servo.
 
         Raises LinkError when the servo does not reply, or must not be driven. The process recovers from later faults
         and counts them; no records come meanwhile. When the records are not consumed for 0.5 s the servo is stopped.
         """
-        closed = threading.Event()
+        self._readings = readings = Readings(self.settings.topic, self._drive_settings(), self._health)
         try:
-            self._process = ServoProcess(self._drive_settings())
-            yield self._records(closed)
+            yield readings
         finally:
-            with self._lock:
-                closed.set()
-                process, self._process = self._process, None
-            if process is not None:
-                process.close()
-
-    def _records(self, closed: threading.Event) -> Iterator[Record]:
-        host_ahead_ns = host_time.now_ns() - time.monotonic_ns()
-        starts, sequence = 1, 0  # starts: of the process, since the newest reading
-        while not closed.is_set():
-            process = self._process
-            if process is None:
-                return
-            try:
-                packet = process.receive(WAKE_S)
-            except ProcessEnded as ended:
-                if closed.wait(RESTART_S * starts):
-                    return
-                if starts == MAX_STARTS:
-                    raise LinkError(
-                        f"the servo process ended {starts} times before it read the servo ({ended}): see its own "
-                        "message above; is the memory full, or is this installation damaged?"
-                    ) from None
-                self._restart(process, closed)
-                starts += 1
-                continue
-            except (OSError, ValueError):
-                if closed.is_set():  # the socket was closed during the wait
-                    return
-                raise
-            if isinstance(packet, wire.Health):
-                self._health = packet
-            elif isinstance(packet, wire.Reading):
-                self._error = packet.error
-                yield reading_record(self.settings.topic, packet, host_ahead_ns, sequence)
-                starts, sequence = 0, sequence + 1
-
-    def _restart(self, ended: ServoProcess, closed: threading.Event) -> None:
-        """Replace a process that has ended; the servo's watchdog has stopped it meanwhile."""
-        ended.close()
-        if self._health is not None:
-            self._ended += Counter({name: getattr(self._health, name) for name in TOTALS})
-            self._health = None
-        with self._lock:
-            if not closed.is_set():
-                self._counts["process restarts"] += 1
-                self._process = ServoProcess(self._drive_settings())
+            self._readings = None
+            readings.close()
 
     def _within_limits(self, goal: ServoGoal) -> wire.Goal:
         """The packet of a goal, clamped to the limits; a clamped goal is counted."""
@@ -274,31 +215,12 @@ class Servo(Source[ServoSettings]):
 
 
 NOT_LIVE = "goals while not live"
-STATES = (
-    "connected",
-    "low_latency",
-    "voltage_mv",
-    "temperature_c",
-)  # fields of wire.Health that are states, not totals
-TOTALS = tuple(name for name in wire.Health._fields if name not in STATES)
 
 
 def goal_command(goal: ServoGoal) -> GoalCommand:
     """A goal in the servo's units, within one turn; the speed is at least 1 unit, because 0 means no limit."""
     ticks = min(max(round(goal.position_rad / TICK_RAD), 0), 4095)
     return GoalCommand(ticks, min(max(round(goal.speed_radps / VELOCITY_UNIT_RADPS), 1), 1023))
-
-
-def reading_record(topic: str, reading: wire.Reading, host_ahead_ns: int, sequence: int) -> Record:
-    """Record of a reading: stamp mid-exchange, arrival with the reply. host_ahead_ns: host time - monotonic time."""
-    state = {
-        "position_rad": round(reading.position_ticks * TICK_RAD, 9),
-        "velocity_radps": round(reading.velocity_units * VELOCITY_UNIT_RADPS, 9),
-        "goal_rad": round(reading.goal_ticks * TICK_RAD, 9),
-        "error": reading.error,
-    }
-    stamp_ns = (reading.request_ns + reading.reply_ns) // 2 + host_ahead_ns
-    return Record(topic, reading.reply_ns + host_ahead_ns, stamp_ns, json.dumps(state).encode(), sequence)
 
 
 def parse_state(stamp_ns: int, data: bytes) -> ServoState:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import os
-import select
 import socket
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
 
@@ -18,6 +18,7 @@ from links.dynamixel.drive import DriveSettings
 
 ROOT = Path(__file__).resolve().parents[2]  # the folder of `links`, also when grd is not installed
 ALIVE_S = 0.05  # minimum interval of Alive packets to the process
+BURST = 16  # packets received at a time
 END_S = 1.0  # timeout of ending the process, which takes some milliseconds
 
 
@@ -61,8 +62,12 @@ class ServoProcess:
             return False
         return True
 
-    def receive(self, timeout_s: float) -> wire.Packet | None:
-        """The next packet, None after timeout_s. Raises LinkError with the text of a Fatal packet, or ProcessEnded.
+    def fileno(self) -> int:
+        """Readable when packets have arrived."""
+        return self._socket.fileno()
+
+    def received(self) -> Iterator[wire.Packet]:
+        """Packets that have arrived. Raises LinkError with the text of a Fatal packet, or ProcessEnded.
 
         To be called continuously: the process stops the servo when its parent does not receive.
         """
@@ -70,25 +75,26 @@ class ServoProcess:
         if now_s >= self._alive_s + ALIVE_S:
             self._alive_s = now_s
             self.send(wire.Alive())
-        try:
-            if not select.select([self._socket], [], [], timeout_s)[0]:
-                return None
-            data = self._received()
-        except ConnectionError:
-            data = b""
-        if not data:
-            raise ProcessEnded(f"code {self._process.wait(END_S)}")
-        packet = wire.unpack(data)
-        if isinstance(packet, wire.Fatal):
-            raise LinkError(wire.text_of(packet))
-        return packet
+        for _ in range(BURST):
+            try:
+                data = self._received()
+            except BlockingIOError:
+                return
+            except ConnectionError:
+                data = b""
+            if not data:
+                raise ProcessEnded(f"code {self._process.wait(END_S)}")
+            packet = wire.unpack(data)
+            if isinstance(packet, wire.Fatal):
+                raise LinkError(wire.text_of(packet))
+            yield packet
 
     def _received(self) -> bytes:
         """The next packet's bytes. The reset by a process that left packets unread precedes its Fatal packet."""
         try:
-            return self._socket.recv(wire.MAX_BYTES)
+            return self._socket.recv(wire.MAX_BYTES, socket.MSG_DONTWAIT)
         except ConnectionResetError:
-            return self._socket.recv(wire.MAX_BYTES)
+            return self._socket.recv(wire.MAX_BYTES, socket.MSG_DONTWAIT)
 
     def close(self) -> None:
         """Close the socket: the process stops the servo and ends. A process that does not end is killed."""

@@ -15,12 +15,12 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from ipaddress import IPv4Address
-from typing import Any
+from typing import Any, ClassVar
 
 from pydantic import Field, model_validator
 
 from flow.counters import Counters
-from flow.link import LinkError, Record, Source, SourceSettings
+from flow.link import LinkError, PolledRecords, Record, Source, SourceSettings
 from links.lidar.decode import FiringRows, compile_kernels
 from links.lidar.formats import AnyFormat, packet_format, recognised_model
 from links.lidar.lidar_clock import ClockMode, LidarClock
@@ -63,12 +63,16 @@ class LidarSettings(SourceSettings):
 class Lidar(Source[LidarSettings]):
     """One LiDAR. Set `sender` (the LiDAR's address) to listen beyond loopback."""
 
+    polled: ClassVar[bool] = True
+
     def __init__(self, settings: LidarSettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
         settings = self.settings
         clock = LidarClock(settings.clock, round(1e9 * settings.clock_limit_s))
         self.form = packet_format(settings.unit.model, settings.unit.beams)
         self._stream = PacketStream(settings.topic, clock, self.form, round(1e6 * settings.slice_ms))
+        self._waits_for_lock: bool = False  # clock: utc, data packets are refused
+        self._lock_deadline_s: float = 0.0  # of that
         self._locked_once: bool = False  # clock: utc, since the start of `listen`: data packets are accepted
         self._position_s: float = 0.0  # arrival of the newest position packet, monotonic
         self._pps = PpsMonitor()
@@ -92,7 +96,7 @@ class Lidar(Source[LidarSettings]):
         return {topic: {**known, "port": str(port)} for topic, port in ports.items()}
 
     @contextmanager
-    def listen(self) -> Iterator[Iterator[Record]]:
+    def listen(self) -> Iterator[PolledRecords]:
         """Receive packets: `with lidar.listen() as records`. LinkError as `listen_udp`, or without UTC lock."""
         settings = self.settings
         compile_kernels()
@@ -104,32 +108,29 @@ class Lidar(Source[LidarSettings]):
         if settings.position_port is not None:
             channels.append(Channel(POSITION_TOPIC, settings.position_port))
         sender = None if settings.sender is None else str(settings.sender)
+        self._waits_for_lock, self._lock_deadline_s = settings.clock == "utc", time.monotonic() + settings.timeout_s
+        first_pulse_ns, accepts = self.form.first_pulse_ns, self._accepts
         with listen_udp(
-            channels, str(settings.bind), sender, settings.timeout_s, self._udp, self.form.first_pulse_ns
+            channels, str(settings.bind), sender, settings.timeout_s, self._udp, first_pulse_ns, accepts
         ) as records:
             try:
-                yield self._with_lock_check(records) if settings.position_port is not None else records
+                yield records
             finally:
                 self._locked_once = False
 
-    def _with_lock_check(self, records: Iterator[Record]) -> Iterator[Record]:
-        """All records, position packets monitored; with `clock: utc` no data packet before the clock is locked."""
-        settings = self.settings
-        waiting, deadline_s = settings.clock == "utc", time.monotonic() + settings.timeout_s
-        for record in records:
-            if record.topic == POSITION_TOPIC:
-                self._pps.add(record.data)
-                waiting = waiting and not self._pps.locked
-                self._position_s = time.monotonic()
-                self._locked_once = settings.clock == "utc" and not waiting
-            elif waiting:
-                if time.monotonic() > deadline_s:
-                    raise LinkError(
-                        f"clock: utc, but the sensor's clock is not locked to UTC: {self._pps.describe()}. Check its "
-                        "GPS receiver and PPS wire (the sensor's web page shows both), or set clock: free"
-                    )
-                continue
-            yield record
+    def _accepts(self, record: Record) -> bool:
+        """Whether the packet is used: position packets are monitored; `clock: utc` accepts no data before the lock."""
+        if record.topic == POSITION_TOPIC:
+            self._pps.add(record.data)
+            self._waits_for_lock = self._waits_for_lock and not self._pps.locked
+            self._position_s = time.monotonic()
+            self._locked_once = self.settings.clock == "utc" and not self._waits_for_lock
+        elif self._waits_for_lock and time.monotonic() > self._lock_deadline_s:
+            raise LinkError(
+                f"clock: utc, but the sensor's clock is not locked to UTC: {self._pps.describe()}. Check its "
+                "GPS receiver and PPS wire (the sensor's web page shows both), or set clock: free"
+            )
+        return record.topic == POSITION_TOPIC or not self._waits_for_lock
 
     @property
     def status(self) -> str | None:

@@ -9,23 +9,21 @@ Source: VLP-16 User Manual 63-9243 Rev. E, section 9.3 (ports).
 from __future__ import annotations
 
 import errno
-import select
 import socket
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from flow.link import LinkError, Record
+from flow.link import WAKE_S, LinkError, PolledRecords, Record
 from links.clock import datagram_time
 
 FirstPulse = Callable[[int, bytes], int]  # time of the first pulse from arrival [ns] and payload
+Accepts = Callable[[Record], bool]  # LinkError: the sensor is not ready
 RECEIVE_BUFFER_BYTES = 1 << 20  # 0.6 s of packets, if the host's net.core.rmem_max allows it
 _DATAGRAM_BYTES = 65_536  # an Ouster's packets are up to 33 kB
 _BURST = 16  # datagrams read per `select`: a call of `select` costs as much as reading a datagram
-_WAKE_S = 0.2  # how often a waiting listener checks whether it was closed
 
 
 @dataclass(slots=True)
@@ -52,20 +50,20 @@ def listen_udp(
     timeout_s: float,
     counters: UdpCounters,
     first_pulse_ns: FirstPulse,
-) -> Iterator[Iterator[Record]]:
-    """Open a socket per channel and yield an iterator of records.
+    accepts: Accepts,
+) -> Iterator[PolledRecords]:
+    """Open a socket per channel and yield the records that are accepted; they end with the context.
 
     Raises LinkError when a socket cannot be opened, or when nothing arrives on the first channel for timeout_s.
     `record.stamp_ns` is when the packet's first laser fired, estimated from its arrival (`first_pulse_ns`).
-    The iterator ends when the context is left, also from another thread.
     """
-    closed = threading.Event()
     with ExitStack() as stack:
         sockets = {stack.enter_context(_open(bind, channel.port)): channel for channel in channels}
+        packets = Packets(sockets, sender, timeout_s, counters, first_pulse_ns, accepts)
         try:
-            yield _records(sockets, closed, sender, timeout_s, counters, first_pulse_ns)
+            yield packets
         finally:
-            closed.set()
+            packets.closed.set()
 
 
 def _open(bind: str, port: int) -> socket.socket:
@@ -89,40 +87,61 @@ def _bind_advice(error: OSError) -> str:
     return "Check `bind` and `port`."
 
 
-def _records(
-    sockets: dict[socket.socket, Channel],
-    closed: threading.Event,
-    sender: str | None,
-    timeout_s: float,
-    counters: UdpCounters,
-    first_pulse_ns: FirstPulse,
-) -> Iterator[Record]:
-    first = next(iter(sockets.values()))
-    deadline_s = time.monotonic() + timeout_s
-    foreign_before = counters.foreign
-    while not closed.is_set():
-        try:
-            ready, _, _ = select.select(list(sockets), [], [], min(_WAKE_S, timeout_s))
-            received = [(sockets[udp], datagram) for udp in ready for datagram in _pending(udp)]
-        except (OSError, ValueError) as error:
-            if closed.is_set():
-                return
-            raise LinkError(f"UDP {first.port}: {error}: is the network interface still up?") from error
-        for channel, (data, ancillary, _, (host, _)) in received:
-            if sender is not None and host != sender:
-                counters.foreign += 1
-                counters.last_foreign = host
-                continue
-            arrival_ns = datagram_time.arrival_ns(ancillary)
-            stamp_ns = first_pulse_ns(arrival_ns, data)
-            yield Record(channel.topic, arrival_ns, stamp_ns, data, counters.received)
-            counters.received += 1
-            if channel is first:
-                deadline_s = time.monotonic() + timeout_s
-                foreign_before = counters.foreign
-        if time.monotonic() > deadline_s:
-            foreign = counters.foreign - foreign_before
-            raise LinkError(_timeout_text(first.port, sender, timeout_s, foreign, counters.last_foreign))
+class Packets(PolledRecords):
+    """Records of the packets of some sockets. LinkError when the first one's have ended for `timeout_s`."""
+
+    def __init__(
+        self,
+        sockets: dict[socket.socket, Channel],
+        sender: str | None,
+        timeout_s: float,
+        counters: UdpCounters,
+        first_pulse_ns: FirstPulse,
+        accepts: Accepts,
+    ) -> None:
+        super().__init__()
+        self._sockets, self._first = sockets, next(iter(sockets.values()))
+        self._sender, self._timeout_s, self._counters = sender, timeout_s, counters
+        self._first_pulse_ns, self._accepts = first_pulse_ns, accepts
+        self._received_s = time.monotonic()  # the newest packet of the first socket
+        self._foreign_before = counters.foreign
+
+    @property
+    def files(self) -> list[socket.socket]:
+        """See PolledRecords."""
+        return list(self._sockets)
+
+    @property
+    def wait_s(self) -> float:
+        """See PolledRecords."""
+        return min(WAKE_S, self._timeout_s)
+
+    def pending(self) -> Iterator[Record]:
+        """See PolledRecords."""
+        for udp, channel in self._sockets.items():
+            try:
+                for data, ancillary, _, (host, _) in _pending(udp):
+                    record = self._record(channel, data, ancillary, host)
+                    if record is not None and self._accepts(record):
+                        yield record
+            except OSError as error:
+                raise LinkError(f"UDP {channel.port}: {error}: is the network interface still up?") from error
+        if time.monotonic() > self._received_s + self._timeout_s:
+            foreign = self._counters.foreign - self._foreign_before
+            port, last = self._first.port, self._counters.last_foreign
+            raise LinkError(_timeout_text(port, self._sender, self._timeout_s, foreign, last))
+
+    def _record(self, channel: Channel, data: bytes, ancillary: Any, host: str) -> Record | None:
+        counters = self._counters
+        if self._sender is not None and host != self._sender:
+            counters.foreign += 1
+            counters.last_foreign = host
+            return None
+        arrival_ns = datagram_time.arrival_ns(ancillary)
+        if channel is self._first:
+            self._received_s, self._foreign_before = time.monotonic(), counters.foreign
+        counters.received += 1
+        return Record(channel.topic, arrival_ns, self._first_pulse_ns(arrival_ns, data), data, counters.received - 1)
 
 
 def _pending(udp: socket.socket) -> Iterator[Any]:

@@ -144,7 +144,12 @@ TOPICS: dict[str, Topic] = {
         _raw("/cues/nmea", "nmea", "NMEA sentences of the vehicle's GNSS receiver"),
         _raw("/clock", "empty", "empty: a tick of the host's clock in a live run"),
         _raw("/run/order", "grd-order", "order of the inputs of each stage, live runs only: flow/live/input_order.py"),
-        _json("/run/end", "grd.RunEnd", {"output_hash": {"type": "string"}}, "the live run's hash, written at its end"),
+        _json(
+            "/run/end",
+            "grd.RunEnd",
+            {"output_hash": {"type": ["string", "null"]}},
+            "the live run's hash, written at its end",
+        ),
         _json("/truth/vehicle", "grd.Pose", _POSE, "T_world_vehicle; simulated only, never wired to a stage"),
         _json("/truth/drone", "grd.Pose", _POSE, "T_world_drone; simulated only, never wired to a stage"),
         _json("/truth/hits", "grd.Hits", _HITS, "pulses of one LiDAR packet that the drone returned; simulated only"),

@@ -62,19 +62,22 @@ def rerun_into(
     for name, order in orders.items():
         if order.cut_off:
             warnings.append(f"{name}: part of its input order is missing; the re-run ends there")
-    digest, truth, live_hash = Digest(), read_truth_file(recording), None
+    digest, truth, end = Digest(), read_truth_file(recording), None
     with RunFolder(folder, recording, request, graph, started_s) as run:
         rerun = Rerun(graph, orders, (digest, *run.taps))
         for record in session.records(progress=progress):
             if record.topic == END_TOPIC:
-                live_hash = _hash_of(record.data)
+                end = record.data
             rerun.feed(record)
         report = rerun.finish()
         warnings += [f"{name}: {n} messages of the live run are missing" for name, n in rerun.left.items()]
         warnings = [*session.warnings, *warnings]
         result = run.finish(report, digest.hexdigest(), truth, warnings, parts=len(session.parts))
-    if live_hash is None:
+    if end is None:
         return RerunResult(result, True, "the live run was interrupted, so its hash is not known")
+    live_hash = _hash_of(end)
+    if live_hash is None:
+        return RerunResult(result, True, "the live run computed no hash to compare: record it with grd run --hash")
     same_hash = live_hash == result.output_hash
     return RerunResult(result, same_hash, f"the live run's hash is {'the same' if same_hash else live_hash}")
 
@@ -124,6 +127,7 @@ def _limit(values: dict[str, Any], recording: Path) -> None:
 
 def _hash_of(data: bytes) -> str | None:
     try:
-        return str(json.loads(data)["output_hash"])
+        output_hash = json.loads(data)["output_hash"]
+        return None if output_hash is None else str(output_hash)
     except (ValueError, TypeError, KeyError):
         return None

@@ -61,14 +61,16 @@ def run_live(
     show: ShowStatus,
     for_s: float | None = None,
     extra: tuple[Tap, ...] = (),
+    *,
+    hashed: bool = False,
 ) -> RunResult:
     """Run live until SIGINT, SIGTERM, `for_s` seconds, or a stage that stops it. Raises LinkError.
 
-    `graph` is `live_graph(request)`. `extra` taps are added to those of the configuration. Call it from the main
-    thread only.
+    `graph` is `live_graph(request)`. `extra` taps are added to those of the configuration. `hashed`: compute the output
+    hash. Call it from the main thread only.
     """
     started_s = time.monotonic()
-    digest = Digest()
+    digest = Digest() if hashed else None
     recorder = next((spec for spec in graph.nodes.values() if issubclass(spec.cls, Recorder)), None)
     recording = folder / (str(recorder.config.get("file", "flight.mcap")) if recorder else "not recorded")
     with RunFolder(folder, recording, request, graph, started_s, live=True) as run, stop_signals() as stop:
@@ -87,7 +89,7 @@ def run_live(
             report = live.stop()
         _show(live, live_since_s, show, run)
         gc.unfreeze()
-        return run.finish(report, digest.hexdigest(), None, [], usage)
+        return run.finish(report, None if digest is None else digest.hexdigest(), None, [], usage)
 
 
 def _show(live: Live, live_since_s: float, show: ShowStatus, run: RunFolder, used: str = "") -> None:

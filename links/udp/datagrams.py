@@ -10,20 +10,19 @@ from __future__ import annotations
 
 import json
 import socket
-import threading
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from ipaddress import IPv4Address
 from typing import Any, ClassVar
 
 from pydantic import Field, model_validator
 
-from flow.link import LinkError, Record, SourceSettings
+from flow.link import LinkError, PolledRecords, Record, SourceSettings
 from links.clock import datagram_time
 
 DATAGRAM_BYTES = 4096
-WAKE_S = 0.2  # how often a waiting listener checks whether it was closed
+BURST = 16  # datagrams read at a time
 MAX_AGE_S = 1.0
 WRONG_AGE = "age_s invalid or too large"  # counter
 
@@ -47,15 +46,17 @@ class UdpSettings(SourceSettings):
 
 
 @contextmanager
-def listen_udp(settings: UdpSettings, counters: Counter[str]) -> Iterator[Iterator[Record]]:
-    """Open the socket and yield an iterator of records, which ends with the context.
+def listen_udp(
+    settings: UdpSettings, counters: Counter[str], topic_of: Callable[[bytes], str] | None = None
+) -> Iterator[PolledRecords]:
+    """Open the socket and yield the records, which end with the context.
 
-    LinkError without `port`, or when the socket cannot be opened.
+    `topic_of`: the topic of a datagram, if it is not always the settings' one. LinkError without `port`, or when the
+    socket cannot be opened.
     """
     what, port, bind = settings.what, settings.port, str(settings.bind)
     if port is None:
         raise LinkError(f"{settings.topic}: set `port` to receive {what}, or remove the link")
-    closed = threading.Event()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
         try:
             datagram_time.enable_stamps(udp)
@@ -65,35 +66,54 @@ def listen_udp(settings: UdpSettings, counters: Counter[str]) -> Iterator[Iterat
                 f"cannot listen on UDP {bind}:{port} for {what}: {error.strerror}. Check `bind` and `port`; "
                 "is another grd listening there?"
             ) from error
-        udp.settimeout(WAKE_S)
+        udp.setblocking(False)
+        records = Datagrams(udp, settings, counters, topic_of)
         try:
-            yield _records(udp, closed, settings, counters)
+            yield records
         finally:
-            closed.set()
+            records.closed.set()
 
 
-def _records(
-    udp: socket.socket, closed: threading.Event, settings: UdpSettings, counters: Counter[str]
-) -> Iterator[Record]:
-    sender = None if settings.sender is None else str(settings.sender)
-    while not closed.is_set():
-        try:
-            data, ancillary, _, (host, _) = udp.recvmsg(DATAGRAM_BYTES, datagram_time.ANCILLARY_BYTES)
-        except TimeoutError:
-            continue
-        except OSError as error:
-            if closed.is_set():
+class Datagrams(PolledRecords):
+    """Records of the datagrams of a socket."""
+
+    def __init__(
+        self,
+        udp: socket.socket,
+        settings: UdpSettings,
+        counters: Counter[str],
+        topic_of: Callable[[bytes], str] | None,
+    ) -> None:
+        super().__init__()
+        self._udp, self._settings, self._counters = udp, settings, counters
+        self._sender = None if settings.sender is None else str(settings.sender)
+        self._topic_of = topic_of or (lambda _: settings.topic)
+
+    @property
+    def files(self) -> tuple[socket.socket]:
+        """See PolledRecords."""
+        return (self._udp,)
+
+    def pending(self) -> Iterator[Record]:
+        """See PolledRecords."""
+        for _ in range(BURST):
+            try:
+                data, ancillary, _, (host, _) = self._udp.recvmsg(DATAGRAM_BYTES, datagram_time.ANCILLARY_BYTES)
+            except BlockingIOError:
                 return
-            raise LinkError(f"{settings.what}: {error.strerror}: is the network interface still up?") from error
-        arrival_ns = datagram_time.arrival_ns(ancillary)
-        if sender is not None and host != sender:
-            counters["from other senders"] += 1
-            continue
-        age = age_s(data)
-        if age is None:
-            counters[WRONG_AGE] += 1
-            continue
-        yield Record(settings.topic, arrival_ns, arrival_ns - round(1e9 * age), data)
+            except OSError as error:
+                raise LinkError(
+                    f"{self._settings.what}: {error.strerror}: is the network interface still up?"
+                ) from error
+            arrival_ns = datagram_time.arrival_ns(ancillary)
+            if self._sender is not None and host != self._sender:
+                self._counters["from other senders"] += 1
+                continue
+            age = age_s(data)
+            if age is None:
+                self._counters[WRONG_AGE] += 1
+                continue
+            yield Record(self._topic_of(data), arrival_ns, arrival_ns - round(1e9 * age), data)
 
 
 def age_s(data: bytes) -> float | None:

@@ -12,14 +12,13 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from typing import Any, ClassVar
 
 import numpy as np
 
 from flow.counters import Counters
-from flow.link import Record, Source
+from flow.link import PolledRecords, Record, Source
 from links.udp import UdpSettings, listen_udp
 from stages.geometry.frames import Array64, rotation_from_quaternion_xyzw
 from stages.messages import VehicleMotion
@@ -42,6 +41,7 @@ class VehicleOdometry(Source[VehicleOdometrySettings]):
     """The vehicle's motion. A record without a valid pose is counted in `rejected` and skipped."""
 
     silent_after_s: ClassVar[float | None] = 2.0
+    polled: ClassVar[bool] = True
 
     def __init__(self, settings: VehicleOdometrySettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
@@ -58,7 +58,7 @@ class VehicleOdometry(Source[VehicleOdometrySettings]):
         """Totals since the start: rejected, from other senders."""
         return Counters(self._udp, {"no valid pose": self._rejected})
 
-    def listen(self) -> AbstractContextManager[Iterator[Record]]:
+    def listen(self) -> AbstractContextManager[PolledRecords]:
         """Receive poses: `with odometry.listen() as records`. LinkError without `port`, or when it cannot be opened."""
         return listen_udp(self.settings, self._udp)
 

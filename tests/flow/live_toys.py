@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import mmap
 import queue
+import socket
 import struct
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from flow.graph import Graph, load_graph
-from flow.link import Link, LinkError, Record, Run, Source, SourceSettings, Tap
+from flow.link import Link, LinkError, PolledRecords, Record, Run, Source, SourceSettings, Tap
 from flow.live import Live
 from flow.message import Message
 from flow.stage import Settings, Stage
@@ -82,6 +84,58 @@ class OtherLine(Line):
     """A second one."""
 
     settings_type = OtherLineSettings
+
+
+class Numbers(PolledRecords):
+    """The records of an opened `PolledLine`."""
+
+    def __init__(self, line: PolledLine) -> None:
+        super().__init__()
+        self._line = line
+
+    @property
+    def files(self) -> list[socket.socket]:
+        return [self._line._reader]
+
+    def pending(self) -> list[Record]:
+        with contextlib.suppress(BlockingIOError):
+            self._line._reader.recv(1)
+        return self._line.pending()
+
+
+class PolledLine(Line):
+    """A line that shares a thread: each item is announced by a byte."""
+
+    polled: ClassVar[bool] = True
+
+    def __init__(self, settings: LineSettings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._reader, self._writer = socket.socketpair()
+        self._reader.setblocking(False)
+
+    def pending(self) -> list[Record]:
+        try:
+            data = self._queue.get_nowait()
+        except queue.Empty:
+            return []
+        if data == b"cut":
+            raise LinkError("the line is dead: is it plugged in?")
+        if data == b"burn":
+            raise KeyError("smoke")
+        self._arrival_ns += 10
+        return [Record(self.settings.topic, self._arrival_ns, self._arrival_ns - 5, data)]
+
+    @contextmanager
+    def listen(self) -> Iterator[Numbers]:
+        numbers = Numbers(self)
+        try:
+            yield numbers
+        finally:
+            numbers.closed.set()
+
+    def put(self, *values: object) -> None:
+        super().put(*values)
+        self._writer.send(bytes(len(values)))
 
 
 class Clinging(Line):

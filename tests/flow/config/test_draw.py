@@ -52,6 +52,8 @@ def test_a_queue_is_drawn_where_an_edge_declares_it(tmp_path):
 def test_the_schema_accepts_an_edge_as_text_or_with_its_queue():
     edge = schema()["$defs"]["edge"]["anyOf"]
     assert edge[1]["properties"]["policy"]["enum"] == ["latest", "drop_oldest"]
-    stages = schema()["properties"]["stages"]["additionalProperties"]["properties"]
+    stages, links = (schema()["properties"][kind]["additionalProperties"]["properties"] for kind in ("stages", "links"))
     assert "thread" in stages
-    assert "thread" not in schema()["properties"]["links"]["additionalProperties"]["properties"]
+    assert "thread" in links
+    assert "process" in stages
+    assert "process" not in links

@@ -48,7 +48,7 @@ def grd(tmp_path, monkeypatch):
 
 
 def test_a_live_run_writes_its_folder_and_is_repeated_to_the_same_hash(grd, tmp_path):
-    text = grd("run", "ticks.yaml", "--for", 0.6, "--no-warm-up")
+    text = grd("run", "ticks.yaml", "--for", 0.6, "--no-warm-up", "--hash")
     folder = tmp_path / "out" / "live-ticks"
     assert {path.name for path in folder.iterdir()} >= {"flight.mcap", "summary.json", "config.yaml", "run.log"}
     summary = json.loads((folder / "summary.json").read_text())
@@ -74,7 +74,7 @@ def test_a_live_run_writes_its_folder_and_is_repeated_to_the_same_hash(grd, tmp_
 
 def test_a_run_in_several_parts_is_repeated_and_replayed_as_a_whole(grd, tmp_path):
     (tmp_path / "split.yaml").write_text(CONFIG.replace("Recorder}", "Recorder, config: {split_s: 1}}"))
-    grd("run", "split.yaml", "--for", 2.8, "--no-warm-up")
+    grd("run", "split.yaml", "--for", 2.8, "--no-warm-up", "--hash")
     folder = tmp_path / "out" / "live-split"
     summary = json.loads((folder / "summary.json").read_text())
     parts = summary["counters"]["recorder"]["parts"]
@@ -104,11 +104,18 @@ def test_a_live_recording_has_the_sender_with_the_channel(tmp_path):
 
 
 def test_a_repetition_that_differs_is_a_finding(grd, tmp_path, monkeypatch):
-    grd("run", "ticks.yaml", "--for", 0.3, "--no-warm-up")
+    grd("run", "ticks.yaml", "--for", 0.3, "--no-warm-up", "--hash")
     monkeypatch.setattr("tests.flow.live_toys.Order.finish", lambda self: None)  # another version of a stage
     text = grd("replay", tmp_path / "out" / "live-ticks" / "flight.mcap", "--as-live", "--trust", code=1)
     assert "the live run's hash is " in text
     assert "the same" not in text
+
+
+def test_a_run_without_a_hash_is_repeated_without_comparison(grd, tmp_path):
+    assert "output hash" not in grd("run", "ticks.yaml", "--for", 0.3, "--no-warm-up")
+    text = grd("replay", tmp_path / "out" / "live-ticks" / "flight.mcap", "--as-live", "--trust")
+    assert "the live run computed no hash to compare: record it with grd run --hash" in text
+    assert "output hash" in text
 
 
 def test_a_run_that_cannot_be_repeated_has_a_reason(grd):
@@ -146,7 +153,7 @@ def start(folder: Path, config: str) -> tuple[subprocess.Popen[str], Path]:
     judge = f"  judge: {{use: tests.flow.live_toys.ArrivalTap, config: {{file: '{last}'}}}}\n"
     (folder / "ticks.yaml").write_text(config + judge)
     command = [sys.executable, "-c", "from links.cli import main; main()"]
-    options = ["run", str(folder / "ticks.yaml"), "--out", str(folder / "run"), "--no-warm-up"]
+    options = ["run", str(folder / "ticks.yaml"), "--out", str(folder / "run"), "--no-warm-up", "--hash"]
     child = subprocess.Popen(
         [*command, *options],
         cwd=ROOT,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import time
 
 import pytest
 from hypothesis import given
@@ -15,6 +16,7 @@ from links.cues import Cues
 from links.cues.cues import MAX_REASONS
 from links.cues.parsing import CueParser
 from stages.messages import DroneGnss, UwbRange, VehicleGnss
+from tests.flow.live_toys import PATIENCE_S, Memory, graph_of, run_live
 from tests.links import ports
 
 STAMP_NS = 1_748_773_230_000_000_000
@@ -150,6 +152,26 @@ def test_a_cue_arrives_by_udp_stamped_by_its_age_and_others_senders_are_ignored(
     assert len(list(cues.decode(nmea))) == 1
     assert [record.topic for record in (ranged, nmea)] == list(cues.replay_topics)
     assert cues.counters["from other senders"] == 1
+
+
+def test_a_live_run_has_the_cues_of_json_and_of_nmea(tmp_path):
+    port, memory = ports.free_port(), Memory()
+    text = f"""\
+stages:
+  ticker: {{use: tests.flow.live_toys.Ticker, thread: one, inputs: {{tick: clock.tick}}}}
+links:
+  clock: {{use: links.clock.Clock, thread: one}}
+  cues: {{use: links.cues.Cues, thread: one, config: {{port: {port}}}}}
+"""
+    live = run_live(graph_of(tmp_path, text), [memory])
+    deadline_s = time.monotonic() + PATIENCE_S
+    while len({type(message) for _, _, message in memory._seen}) < 4 and time.monotonic() < deadline_s:
+        ports.send(port, b'{"uwb_range": {"range_m": 5}}')
+        ports.send(port, GGA)
+        time.sleep(0.02)
+    live.stop()
+    names = {output for output, _, _ in memory._seen}
+    assert names == {"clock.tick", "ticker.number", "cues.uwb_range", "cues.vehicle_gnss"}
 
 
 def test_beyond_loopback_a_sender_is_required():

@@ -381,7 +381,7 @@ def test_when_the_servo_process_is_killed_the_watchdog_stops_the_servo_and_a_new
         next(records)
         servo.on_goal(goal(170, 5))
         until(records, lambda s: math.degrees(s["position_rad"]) > 93)
-        os.kill(servo._process.pid, signal.SIGKILL)
+        os.kill(servo._readings.process.pid, signal.SIGKILL)
         eventually(lambda: emulator.get(mx28.BUS_WATCHDOG) == mx28.WATCHDOG_TRIPPED)
         states = until(records, lambda _: servo.counters["process restarts"] == 1)
         assert math.degrees(states[-1]["position_rad"]) < 110
@@ -399,7 +399,7 @@ with servo.listen() as records:
         if number % 100 == 0:  # a loaded machine may lose a goal
             servo.on_goal(ServoGoal(stamp_ns=0, position_rad=3.0, speed_radps=0.5))
         if servo.decode(record).position_rad > 1.65:
-            print(servo._process.pid, flush=True)
+            print(servo._readings.process.pid, flush=True)
             break
     for record in records:
         pass

@@ -9,7 +9,8 @@ import pytest
 
 from flow.link import Record
 from links.dynamixel import Servo, wire
-from links.dynamixel.servo import goal_command, reading_record
+from links.dynamixel.readings import reading_record
+from links.dynamixel.servo import goal_command
 from stages.messages import ServoGoal
 
 GOOD = {"position_rad": 1.5, "velocity_radps": -0.25, "goal_rad": 2.0, "error": 32}

@@ -163,7 +163,7 @@ def test_the_field_stack_finds_the_drone_with_another_lidar(rig, tmp_path):
     config.write_text(text.replace("[sim_live.yaml, rigs/", f"[{ROOT}/configs/sim_live.yaml, {ROOT}/configs/rigs/"))
     grd = [sys.executable, "-c", "from links.cli import main; main()"]
     flight = tmp_path / "flight"
-    run = [*grd, "run", str(config), "--for", "15", "--out", str(flight)]
+    run = [*grd, "run", str(config), "--for", "15", "--hash", "--out", str(flight)]
     done = subprocess.run(run, cwd=ROOT, capture_output=True, text=True, timeout=900, check=False)
     report, live = json.loads((flight / "rig.json").read_text()), json.loads((flight / "summary.json").read_text())
     print(report, live["live"]["edges"]["track.pulses"], done.stdout)  # noqa: T201
@@ -178,7 +178,7 @@ def test_the_field_stack_flies_with_the_simulated_rig_and_is_replayed_to_its_has
     pytest.importorskip("embreex", reason="simulating needs embreex: pip install -e '.[simulate]'")
     grd = [sys.executable, "-c", "from links.cli import main; main()"]
     flight = tmp_path / "flight"
-    run = [*grd, "run", "configs/sim_live.yaml", "--for", "15", "--out", str(flight)]
+    run = [*grd, "run", "configs/sim_live.yaml", "--for", "15", "--hash", "--out", str(flight)]
     done = subprocess.run(run, cwd=ROOT, capture_output=True, text=True, timeout=600, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     summary = json.loads((flight / "summary.json").read_text())

@@ -24,7 +24,7 @@ TRUTH_TOPICS = "/truth"
 """Prefix of topics that hold the truth, for evaluation; no source may bring them in (`flow.graph` checks it)."""
 
 WAKE_S = 0.2
-"""Interval at which a source is asked for records, and a waiting thread checks whether it was closed."""
+"""The longest wait before a source is polled again, and before a waiting thread checks whether it was closed."""
 
 RUN_TOPICS = "/run/"
 """Prefix of topics that a live run records about itself (`flow.live.input_order`); no source may bring them in."""
@@ -86,6 +86,7 @@ class PolledRecords(ABC, Iterator[Record]):
         self.closed = threading.Event()
         """Set by any thread: the iterator ends within WAKE_S."""
         self._arrived: deque[Record] = deque()
+        self._error: LinkError | None = None  # raised after the records that came before it
 
     @property
     def files(self) -> Sequence[Readable]:
@@ -105,10 +106,14 @@ class PolledRecords(ABC, Iterator[Record]):
         while not self._arrived:
             if self.closed.is_set():
                 raise StopIteration
+            if self._error is not None:
+                raise self._error
             try:
                 select.select(self.files, [], [], self.wait_s)
                 self._arrived.extend(self.pending())
-            except (OSError, ValueError, LinkError):  # a file is closed by another thread
+            except LinkError as error:
+                self._error = error
+            except (OSError, ValueError):  # a file is closed by another thread
                 if self.closed.is_set():
                     raise StopIteration from None
                 raise
@@ -122,8 +127,8 @@ class Source(Link[SourceS]):
     """A link that brings records in.
 
     Live, `listen` opens the hardware and iterates over records; in replay they come from a recording by `topic`.
-    Both go through the same `decode`, whose annotation declares the outputs. In replay a source may also read what it
-    sent itself (`replay_topics`): live it knows that without a record.
+    Both go through the same `decode`, whose annotation declares the outputs. It takes records of `replay_topics`: its
+    own topic, and in replay what it sent itself, which it knows live without a record.
     """
 
     silent_after_s: ClassVar[float | None] = None  # a source that has sent records and then none for so long has failed

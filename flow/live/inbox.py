@@ -18,7 +18,7 @@ from flow.config.edge import QueueSettings
 from flow.link import Readable
 from flow.message import Message
 
-WAKEUP_BYTES = 4096  # more than are ever waiting
+WAKEUP_BYTES = 64  # more than wait at a time: one for each wait
 
 
 class Item(NamedTuple):
@@ -61,6 +61,10 @@ class PolledWakeup(Wakeup):
         self._sender.setblocking(False)
         self._woken = False
 
+    def wait(self, inboxes: Sequence[Inbox], timeout_s: float) -> None:
+        """See Wakeup."""
+        self.wait_for_files(inboxes, (), timeout_s)
+
     def wait_for_files(self, inboxes: Sequence[Inbox], files: Sequence[Readable], timeout_s: float) -> list[Readable]:
         """Wait for one of the inboxes or of the files; those files that are readable."""
         with self.changed:
@@ -71,6 +75,7 @@ class PolledWakeup(Wakeup):
             self._someone_waits = False
         if self._receiver in ready:
             self._receiver.recv(WAKEUP_BYTES)
+            ready.remove(self._receiver)
         return ready
 
     def notify(self) -> None:
@@ -86,7 +91,7 @@ class PolledWakeup(Wakeup):
             self.notify()
 
     def close(self) -> None:
-        """End it with its thread."""
+        """Close the sockets, as the thread ends."""
         with self.changed:
             self._someone_waits = False
             self._receiver.close()
@@ -99,6 +104,7 @@ class Inbox:
     def __init__(self, ports: Sequence[QueueSettings], wakeup: Wakeup | None = None) -> None:
         self._ports: list[deque[Item]] = [deque() for _ in ports]
         self._depths = [port.depth for port in ports]
+        self._deadlines_ns = [round(port.deadline_ms * 1e6) for port in ports]
         self._order = 0
         self.wakeup = wakeup or Wakeup()
         self._changed = self.wakeup.changed
@@ -126,6 +132,13 @@ class Inbox:
         with self._changed:
             queue = self._first()
             return None if queue is None else queue.popleft()
+
+    @property
+    def due_ns(self) -> int | None:
+        """Deadline of the message that `take` gives; None: no message is queued."""
+        with self._changed:
+            queue = self._first()
+            return None if queue is None else queue[0].arrival_ns + self._deadlines_ns[queue[0].port]
 
     def take_all(self) -> list[Item]:
         """All queued messages, in the order of putting."""

@@ -1,7 +1,9 @@
 """The thread of stages and of the sources that share it: one loop, as a replay is one.
 
-A thread that waits for packets beside one that computes takes Python's lock from it for each packet, and both pay for
-the change. Here the sources are asked between two messages of the stages.
+A thread that waits for packets beside one that computes takes Python's lock from it for each packet, and each switch
+costs CPU time in both. Here the sources are polled between two messages of the stages. So a stage that computes for
+long delays them: packets then wait in the kernel's buffer (`net.core.rmem_max`), and the servo's worker stops the servo
+when nothing polls it for half a second.
 
 Source: ours.
 """
@@ -14,8 +16,9 @@ from collections.abc import Sequence
 from flow.live.inbox import PolledWakeup
 from flow.live.source import PolledSource, SourceRun
 from flow.live.threads import WAIT_S, Shared, StageRun, StageThread
+from flow.ports import RunError, named
 
-POLL_S = 0.002  # interval at which the sources are asked while messages are queued
+POLL_S = 0.002  # interval at which the sources are polled while messages are queued
 
 
 class SharedThread(StageThread):
@@ -29,17 +32,29 @@ class SharedThread(StageThread):
         self._poll_wakeup = wakeup
 
     def run(self) -> None:
+        try:
+            with named(self.name):
+                self._loop()
+        except RunError as error:
+            self.shared.events.report(self.name, f"{error}: none of its stages and sources works any more")
+        finally:
+            self._end_sources()
+            self._poll_wakeup.close()
+
+    def _loop(self) -> None:
         poll_s = 0.0
         while self._running or self._sources:
-            if self.shared.stopping.is_set() and self._sources:
-                for source in self._sources:
-                    source.end()
-                self._sources = []
+            if self.shared.stopping.is_set():
+                self._end_sources()
             worked, now_s = self.step(), time.monotonic()
             if not worked or now_s >= poll_s:
                 self._poll(0.0 if worked else WAIT_S, now_s)
                 poll_s = time.monotonic() + POLL_S
-        self._poll_wakeup.close()
+
+    def _end_sources(self) -> None:
+        for source in self._sources:
+            source.end()
+        self._sources = []
 
     def wake(self) -> None:
         """Check at once whether the run stops; any thread may call this."""

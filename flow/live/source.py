@@ -166,7 +166,9 @@ class PolledSource:
             with named(f"{self.source.node}.listen"):
                 if self._records is None:
                     records = self.source.open()
-                    assert isinstance(records, PolledRecords), "`polled` sources give PolledRecords"
+                    if not isinstance(records, PolledRecords):
+                        kind = type(self.source.source).__name__
+                        raise LinkError(f"{kind}.listen gives no PolledRecords: leave 'thread' out of its declaration")
                     self._records = records
                 for record in self._records.pending():
                     self.source.take(record)

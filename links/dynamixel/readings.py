@@ -78,7 +78,7 @@ class Readings(PolledRecords):
 
     @property
     def wait_s(self) -> float:
-        """See PolledRecords: the process stops the servo when it does not hear from here."""
+        """See PolledRecords: the process stops the servo when it receives no Alive packets."""
         return ALIVE_S if self._restart_s is None else max(0.0, self._restart_s - time.monotonic())
 
     def pending(self) -> Iterator[Record]:

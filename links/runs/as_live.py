@@ -78,6 +78,8 @@ def rerun_into(
     live_hash = _hash_of(end)
     if live_hash is None:
         return RerunResult(result, True, "the live run computed no hash to compare: record it with grd run --hash")
+    if not live_hash:
+        return RerunResult(result, True, f"the record of the live run's hash is damaged ({END_TOPIC}): not compared")
     same_hash = live_hash == result.output_hash
     return RerunResult(result, same_hash, f"the live run's hash is {'the same' if same_hash else live_hash}")
 
@@ -126,8 +128,9 @@ def _limit(values: dict[str, Any], recording: Path) -> None:
 
 
 def _hash_of(data: bytes) -> str | None:
+    """The live run's hash; None: not computed; empty: the record is damaged."""
     try:
         output_hash = json.loads(data)["output_hash"]
         return None if output_hash is None else str(output_hash)
     except (ValueError, TypeError, KeyError):
-        return None
+        return ""

@@ -8,8 +8,8 @@ import threading
 import pytest
 
 from flow.config.classes import known_classes
-from flow.link import LinkError, PolledRecords, Source
-from tests.flow.live_toys import PATIENCE_S, PolledLine
+from flow.link import LinkError, PolledRecords, Record, Source
+from tests.flow.live_toys import PolledLine
 
 
 def test_the_iterator_waits_for_records_and_ends_when_it_is_closed():
@@ -31,15 +31,32 @@ def test_an_error_of_the_source_is_raised_by_the_iterator():
             next(records)
 
 
-class Torn(PolledRecords):
-    """Waits for a file that another thread closes."""
+def test_records_before_an_error_are_given_before_it():
+    class Ending(PolledRecords):
+        wait_s = 0.0
 
-    def __init__(self, file: socket.socket) -> None:
+        def pending(self):
+            yield Record("/numbers", 1, 1, b"1")
+            raise LinkError("that was all")
+
+    records = Ending()
+    assert next(records).data == b"1"
+    with pytest.raises(LinkError, match="that was all"):
+        next(records)
+
+
+class Torn(PolledRecords):
+    """Waits for a file that is closed meanwhile, with or without the records."""
+
+    def __init__(self, file: socket.socket, closed: bool) -> None:
         super().__init__()
-        self._file = file
+        self._file, self._with_records = file, closed
 
     @property
     def files(self) -> list[socket.socket]:
+        self._file.close()
+        if self._with_records:
+            self.closed.set()
         return [self._file]
 
     def pending(self) -> list:
@@ -50,11 +67,8 @@ class Torn(PolledRecords):
 def test_a_closed_file_is_an_error_unless_the_records_are_closed(closed):
     near, far = socket.socketpair()
     with far:
-        near.close()
-        records = Torn(near)
+        records = Torn(near, closed)
         if closed:
-            threading.Timer(0.0, records.closed.set).start()
-            records.closed.wait(PATIENCE_S)
             assert list(records) == []
         else:
             with pytest.raises(ValueError, match="file descriptor"):

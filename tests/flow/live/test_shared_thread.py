@@ -8,6 +8,7 @@ import pytest
 
 from flow.config_error import ConfigError
 from flow.live.report import LinkState
+from flow.live.shared_thread import SharedThread
 from tests.flow.live_toys import PATIENCE_S, Memory, Numbers, graph_of, run_live
 
 TOYS = "tests.flow.live_toys"
@@ -61,6 +62,53 @@ def test_a_source_that_fails_is_reopened_and_the_other_goes_on_meanwhile(tmp_pat
     assert (report.links["line"].openings, report.links["other"].openings) == (3, 1)
 
 
+def test_a_source_that_waits_to_be_reopened_delays_no_other(tmp_path, monkeypatch):
+    monkeypatch.setattr("flow.live.source.FIRST_PAUSE_S", 3600.0)
+    live = run_live(graph_of(tmp_path, SHARED))
+    live.nodes["line"].put(1, "cut")
+    live.nodes["collector"].take(1)
+    live.nodes["other"].put(*range(20))
+    assert len(live.nodes["collector"].take(20)) == 20
+    report = live.stop()
+    assert (report.links["line"].openings, report.links["line"].state) == (1, LinkState.CLOSED)
+
+
+def test_an_error_of_the_thread_itself_is_reported_and_closes_its_sources(tmp_path, monkeypatch):
+    monkeypatch.setattr(SharedThread, "_poll", lambda *_: (_ for _ in ()).throw(OSError("no more files")))
+    live = run_live(graph_of(tmp_path, SHARED))
+    report = live.stop()
+    text = "stage one: stage one failed: OSError: no more files: none of its stages and sources works any more"
+    assert text in [str(event) for event in report.events]
+    assert report.links["line"].state is LinkState.CLOSED
+
+
+def test_the_message_with_the_earliest_deadline_is_first(tmp_path):
+    text = f"""\
+stages:
+  gate: {{use: {TOYS}.Gate, thread: one, inputs: {{number: line.number}}}}
+  late: {{use: {TOYS}.Brittle, thread: one, inputs: {{number: {{from: other.number, deadline_ms: 60000}}}}}}
+  soon: {{use: {TOYS}.Brittle, thread: one, inputs: {{number: {{from: third.number, deadline_ms: 1}}}}}}
+links:
+  line: {{use: {TOYS}.Line}}
+  other: {{use: {TOYS}.Line, config: {{topic: /others}}}}
+  third: {{use: {TOYS}.Line, config: {{topic: /third}}}}
+"""
+    memory = Memory()
+    live = run_live(graph_of(tmp_path, text), [memory])
+    runs = {run.stage.name: run for run in live._wiring.stages}
+    live.nodes["line"].put(1)
+    assert runs["gate"].stage._stage._entered.wait(PATIENCE_S)
+    for stage, source in (("late", "other"), ("soon", "third")):  # these queue up, the later deadline first
+        live.nodes[source].put(1, 2)
+        deadline_s = time.monotonic() + PATIENCE_S
+        while runs[stage].inbox.waiting(0) < 2 and time.monotonic() < deadline_s:
+            time.sleep(0.005)
+    runs["gate"].stage._stage._open.set()
+    live.stop()
+    given = [output for output, _, _ in memory._seen if output in ("late.number", "soon.number")]
+    assert given == ["soon.number"] * 2 + ["late.number"] * 2
+
+
 def test_what_was_received_before_the_stop_is_processed(tmp_path):
     live = run_live(graph_of(tmp_path, SHARED))
     live.nodes["line"].put(*range(200))
@@ -89,7 +137,7 @@ def test_messages_of_another_thread_and_the_end_of_the_run_wake_a_waiting_thread
 @pytest.mark.parametrize(
     ("old", "new", "text"),
     [
-        ("PolledLine, thread: one, config", "Line, thread: one, config", "blocks, so it needs a thread of its own"),
+        ("PolledLine, thread: one, config", "Line, thread: one, config", "cannot share a thread"),
         ("Brittle, thread: one", "Brittle, thread: one, low_priority: true", "this source would pause with it"),
         ("PolledLine, thread: one}", "PolledLine, thread: 1}", "must be a name as stages have, got 1"),
     ],

@@ -104,7 +104,6 @@ class Inbox:
     def __init__(self, ports: Sequence[QueueSettings], wakeup: Wakeup | None = None) -> None:
         self._ports: list[deque[Item]] = [deque() for _ in ports]
         self._depths = [port.depth for port in ports]
-        self._deadlines_ns = [round(port.deadline_ms * 1e6) for port in ports]
         self._order = 0
         self.wakeup = wakeup or Wakeup()
         self._changed = self.wakeup.changed
@@ -132,13 +131,6 @@ class Inbox:
         with self._changed:
             queue = self._first()
             return None if queue is None else queue.popleft()
-
-    @property
-    def due_ns(self) -> int | None:
-        """Deadline of the message that `take` gives; None: no message is queued."""
-        with self._changed:
-            queue = self._first()
-            return None if queue is None else queue[0].arrival_ns + self._deadlines_ns[queue[0].port]
 
     def take_all(self) -> list[Item]:
         """All queued messages, in the order of putting."""

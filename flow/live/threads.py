@@ -121,13 +121,7 @@ class StageRun:
 
 
 class StageThread(RunThread):
-    """Runs one stage, or several that share the thread: the message with the earliest deadline first.
-
-    An edge's deadline (`deadline_ms`) counts from the arrival of the record that caused the message, so that no stage
-    waits for ever while others have much to do.
-
-    Source: Liu and Layland, Scheduling algorithms for multiprogramming (J. ACM 1973), deadline driven.
-    """
+    """Runs one stage, or several that share the thread: consumers before producers."""
 
     def __init__(
         self, name: str, stages: list[StageRun], wakeup: Wakeup, shared: Shared, throttle: Throttle | None = None
@@ -144,23 +138,20 @@ class StageThread(RunThread):
                 self._wakeup.wait(self._inboxes, WAIT_S)
 
     def step(self) -> bool:
-        """The message with the earliest deadline; of equal ones that of the last consumer. False: none is queued."""
-        next_stage, next_ns = None, 0
+        """One message of one stage. False: no message is queued."""
         for stage in self._running:
-            due_ns = stage.inbox.due_ns
-            if due_ns is not None and (next_stage is None or due_ns < next_ns):
-                next_stage, next_ns = stage, due_ns
-            elif due_ns is None and stage.inbox.done:
+            item = stage.inbox.take()
+            if item is not None:
+                stage.take(item)
+                if self._throttle is not None and stage.takes_newest(item.port):
+                    self._pause(stage.stage.name, self._throttle)
+                return True
+            if stage.inbox.done:
                 if not stage.ended.is_set():
                     stage.end()
                 self._running = [other for other in self._running if other is not stage]
                 return True
-        item = None if next_stage is None else next_stage.inbox.take()
-        if next_stage is not None and item is not None:
-            next_stage.take(item)
-            if self._throttle is not None and next_stage.takes_newest(item.port):
-                self._pause(next_stage.stage.name, self._throttle)
-        return next_stage is not None
+        return False
 
     def _pause(self, stage: str, throttle: Throttle) -> None:
         """After an image, for as long as other stages need it."""

@@ -82,33 +82,6 @@ def test_an_error_of_the_thread_itself_is_reported_and_closes_its_sources(tmp_pa
     assert report.links["line"].state is LinkState.CLOSED
 
 
-def test_the_message_with_the_earliest_deadline_is_first(tmp_path):
-    text = f"""\
-stages:
-  gate: {{use: {TOYS}.Gate, thread: one, inputs: {{number: line.number}}}}
-  late: {{use: {TOYS}.Brittle, thread: one, inputs: {{number: {{from: other.number, deadline_ms: 60000}}}}}}
-  soon: {{use: {TOYS}.Brittle, thread: one, inputs: {{number: {{from: third.number, deadline_ms: 1}}}}}}
-links:
-  line: {{use: {TOYS}.Line}}
-  other: {{use: {TOYS}.Line, config: {{topic: /others}}}}
-  third: {{use: {TOYS}.Line, config: {{topic: /third}}}}
-"""
-    memory = Memory()
-    live = run_live(graph_of(tmp_path, text), [memory])
-    runs = {run.stage.name: run for run in live._wiring.stages}
-    live.nodes["line"].put(1)
-    assert runs["gate"].stage._stage._entered.wait(PATIENCE_S)
-    for stage, source in (("late", "other"), ("soon", "third")):  # these queue up, the later deadline first
-        live.nodes[source].put(1, 2)
-        deadline_s = time.monotonic() + PATIENCE_S
-        while runs[stage].inbox.waiting(0) < 2 and time.monotonic() < deadline_s:
-            time.sleep(0.005)
-    runs["gate"].stage._stage._open.set()
-    live.stop()
-    given = [output for output, _, _ in memory._seen if output in ("late.number", "soon.number")]
-    assert given == ["soon.number"] * 2 + ["late.number"] * 2
-
-
 def test_what_was_received_before_the_stop_is_processed(tmp_path):
     live = run_live(graph_of(tmp_path, SHARED))
     live.nodes["line"].put(*range(200))

@@ -18,7 +18,7 @@ from flow.live.source import PolledSource, SourceRun
 from flow.live.threads import WAIT_S, Shared, StageRun, StageThread
 from flow.ports import RunError, named
 
-POLL_S = 0.002  # interval at which the sources are polled while messages are queued
+POLL_S = 0.002  # shortest interval of polls while messages are queued; the stages get at least as long as a poll took
 
 
 class SharedThread(StageThread):
@@ -48,8 +48,8 @@ class SharedThread(StageThread):
                 self._end_sources()
             worked, now_s = self.step(), time.monotonic()
             if not worked or now_s >= poll_s:
-                self._poll(0.0 if worked else WAIT_S, now_s)
-                poll_s = time.monotonic() + POLL_S
+                took_s = self._poll(0.0 if worked else WAIT_S, now_s)
+                poll_s = time.monotonic() + max(POLL_S, took_s)
 
     def _end_sources(self) -> None:
         for source in self._sources:
@@ -60,8 +60,8 @@ class SharedThread(StageThread):
         """Check at once whether the run stops; any thread may call this."""
         self._poll_wakeup.wake()
 
-    def _poll(self, timeout_s: float, now_s: float) -> None:
-        """Wait for messages and sources, at most so long, and take what the sources have."""
+    def _poll(self, timeout_s: float, now_s: float) -> float:
+        """Wait for messages and sources, at most so long, and take what the sources have: for how long [s]."""
         files = [file for source in self._sources for file in source.files]
         due_s = min((source.due_s for source in self._sources), default=now_s + timeout_s)
         ready = self._poll_wakeup.wait_for_files(self._inboxes, files, max(0.0, min(timeout_s, due_s - now_s)))
@@ -69,3 +69,4 @@ class SharedThread(StageThread):
         for source in self._sources:
             if source.due_s <= now_s or any(file in ready for file in source.files):
                 source.step()
+        return time.monotonic() - now_s

@@ -168,10 +168,11 @@ def _check_threads(tree: Tree, nodes: dict[str, NodeSpec]) -> None:
             text = f"'{other}' has low_priority and the same thread, '{spec.thread}': both would pause."
             tree.error(("stages", spec.name, "thread"), text)
         if spec.kind == "links" and spec.thread and not (issubclass(spec.cls, Source) and spec.cls.polled):
-            text = "cannot share a thread (Source.polled): leave 'thread' out, or write 'thread: null'."
+            text = f"{spec.cls.__name__} needs a thread of its own: leave 'thread' out, or write 'thread: null'."
             tree.error(("links", spec.name, "thread"), text)
         if spec.kind == "links" and spec.thread in low_priority:
-            text = f"'{low_priority[spec.thread].name}' has low_priority, so this source would pause with it."
+            other = low_priority[spec.thread].name
+            text = f"'{other}' has low_priority, so this source would pause with it: name another thread."
             tree.error(("links", spec.name, "thread"), text)
 
 

@@ -30,6 +30,8 @@ class SourceRun:
         self.compute = Latency()
         self.report = LinkReport()
         self.first_ns = self.last_ns = 0
+        self.polled_s: float | None = None
+        """When it was last polled, monotonic; None: a thread of its own waits for its records."""
         self.ended = threading.Event()
         self._outputs = outputs
         self._topics = source.replay_topics
@@ -85,6 +87,8 @@ class SourceRun:
             or now_s < self._last_change[1] + after_s
         ):
             return None
+        if self.polled_s is not None and now_s > self.polled_s + after_s:
+            return f"is not read for {after_s:g} s: a stage in its thread computes for too long"
         return f"has sent nothing for {after_s:g} s: is it powered, and its cable plugged in?"
 
     def take(self, record: Record) -> None:
@@ -162,6 +166,7 @@ class PolledSource:
 
     def step(self) -> None:
         """Take what has arrived; open the link first if it is closed."""
+        self.source.polled_s = time.monotonic()
         try:
             with named(f"{self.source.node}.listen"):
                 if self._records is None:

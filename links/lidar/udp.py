@@ -14,16 +14,15 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from flow.link import WAKE_S, LinkError, PolledRecords, Record
 from links.clock import datagram_time
 
 FirstPulse = Callable[[int, bytes], int]  # time of the first pulse from arrival [ns] and payload
 Accepts = Callable[[Record], bool]  # LinkError: the sensor is not ready
-RECEIVE_BUFFER_BYTES = 1 << 20  # 0.6 s of packets, if the host's net.core.rmem_max allows it
+RECEIVE_BUFFER_BYTES = 1 << 20  # 1.2 s of a VLP-16's packets, if the host's net.core.rmem_max allows it
 _DATAGRAM_BYTES = 65_536  # an Ouster's packets are up to 33 kB
-_BURST = 16  # datagrams read per `select`: a call of `select` costs as much as reading a datagram
 
 
 @dataclass(slots=True)
@@ -120,8 +119,8 @@ class Packets(PolledRecords):
         """See PolledRecords."""
         for udp, channel in self._sockets.items():
             try:
-                for data, ancillary, _, (host, _) in _pending(udp):
-                    record = self._record(channel, data, ancillary, host)
+                for data, arrival_ns, host in datagram_time.pending(udp, _DATAGRAM_BYTES):
+                    record = self._record(channel, data, arrival_ns, host)
                     if record is not None and self._accepts(record):
                         yield record
             except OSError as error:
@@ -131,26 +130,16 @@ class Packets(PolledRecords):
             port, last = self._first.port, self._counters.last_foreign
             raise LinkError(_timeout_text(port, self._sender, self._timeout_s, foreign, last))
 
-    def _record(self, channel: Channel, data: bytes, ancillary: Any, host: str) -> Record | None:
+    def _record(self, channel: Channel, data: bytes, arrival_ns: int, host: str) -> Record | None:
         counters = self._counters
         if self._sender is not None and host != self._sender:
             counters.foreign += 1
             counters.last_foreign = host
             return None
-        arrival_ns = datagram_time.arrival_ns(ancillary)
         if channel is self._first:
             self._received_s, self._foreign_before = time.monotonic(), counters.foreign
         counters.received += 1
         return Record(channel.topic, arrival_ns, self._first_pulse_ns(arrival_ns, data), data, counters.received - 1)
-
-
-def _pending(udp: socket.socket) -> Iterator[Any]:
-    """The datagrams in the buffer, as `recvmsg` returns them; none if the kernel discarded a damaged one."""
-    try:
-        for _ in range(_BURST):
-            yield udp.recvmsg(_DATAGRAM_BYTES, datagram_time.ANCILLARY_BYTES)
-    except BlockingIOError:
-        return
 
 
 def _timeout_text(port: int, sender: str | None, timeout_s: float, foreign: int, last_foreign: str) -> str:

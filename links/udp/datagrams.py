@@ -22,7 +22,6 @@ from flow.link import LinkError, PolledRecords, Record, SourceSettings
 from links.clock import datagram_time
 
 DATAGRAM_BYTES = 4096
-BURST = 16  # datagrams read at a time
 MAX_AGE_S = 1.0
 WRONG_AGE = "age_s invalid or too large"  # counter
 
@@ -96,24 +95,18 @@ class Datagrams(PolledRecords):
 
     def pending(self) -> Iterator[Record]:
         """See PolledRecords."""
-        for _ in range(BURST):
-            try:
-                data, ancillary, _, (host, _) = self._udp.recvmsg(DATAGRAM_BYTES, datagram_time.ANCILLARY_BYTES)
-            except BlockingIOError:
-                return
-            except OSError as error:
-                raise LinkError(
-                    f"{self._settings.what}: {error.strerror}: is the network interface still up?"
-                ) from error
-            arrival_ns = datagram_time.arrival_ns(ancillary)
-            if self._sender is not None and host != self._sender:
-                self._counters["from other senders"] += 1
-                continue
-            age = age_s(data)
-            if age is None:
-                self._counters[WRONG_AGE] += 1
-                continue
-            yield Record(self._topic_of(data), arrival_ns, arrival_ns - round(1e9 * age), data)
+        try:
+            for data, arrival_ns, host in datagram_time.pending(self._udp, DATAGRAM_BYTES):
+                if self._sender is not None and host != self._sender:
+                    self._counters["from other senders"] += 1
+                    continue
+                age = age_s(data)
+                if age is None:
+                    self._counters[WRONG_AGE] += 1
+                    continue
+                yield Record(self._topic_of(data), arrival_ns, arrival_ns - round(1e9 * age), data)
+        except OSError as error:
+            raise LinkError(f"{self._settings.what}: {error.strerror}: is the network interface still up?") from error
 
 
 def age_s(data: bytes) -> float | None:

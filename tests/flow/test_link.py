@@ -10,6 +10,7 @@ import pytest
 from flow.config.classes import known_classes
 from flow.link import LinkError, PolledRecords, Record, Source
 from tests.flow.live_toys import PolledLine
+from tests.links.ports import free_port
 
 
 def test_the_iterator_waits_for_records_and_ends_when_it_is_closed():
@@ -82,6 +83,9 @@ def test_the_lidar_the_servo_and_the_odometry_can_share_a_thread():
     assert {cls.__name__ for cls in POLLED} == {"Clock", "Cues", "Lidar", "Servo", "VehicleOdometry"}
 
 
-@pytest.mark.parametrize("cls", POLLED)
+@pytest.mark.parametrize("cls", [cls for cls in POLLED if cls.__name__ != "Servo"])  # opened: test_dynamixel_live.py
 def test_a_source_that_can_share_a_thread_gives_polled_records(cls):
-    assert "PolledRecords" in cls.listen.__annotations__["return"]
+    config = {} if cls.__name__ == "Clock" else {"port": free_port()}
+    with cls(**config).listen() as records:
+        assert isinstance(records, PolledRecords)
+        assert list(records.pending()) == []

@@ -76,9 +76,9 @@ def revolution_in_map(
 ) -> Revolution:
     """The revolution by f firings of all lasers: directions (f, l, 3), ranges and times (f, l).
 
-    `begin` (s + 1,) are the slices' first firings and f. `used` (k,) are the lasers, `shift` (k,) their firings
-    after     the column's, `weights` (2, k) give the radial direction and the axis from the directions of a column,
-    `step_rad` is the     rotor's turn per column.
+    `begin` (s + 1,) are the slices' first firings and f. `used` (k,) are the lasers, `shift` (k,) their firings after
+    the column's, `weights` (2, k) give the radial direction and the axis from the directions of a column, `step_rad` is
+    the rotor's turn per column.
     """
     firings, k = len(range_m), len(used)
     R_map, origin_m = np.empty((firings, 3, 3)), np.empty((firings, 3))

@@ -9,7 +9,7 @@ import pytest
 from flow.config_error import ConfigError
 from flow.live.report import LinkState
 from flow.live.shared_thread import SharedThread
-from tests.flow.live_toys import PATIENCE_S, Memory, Numbers, graph_of, run_live
+from tests.flow.live_toys import PATIENCE_S, Memory, Numbers, PolledLine, graph_of, run_live
 
 TOYS = "tests.flow.live_toys"
 SHARED = f"""\
@@ -73,6 +73,23 @@ def test_a_source_that_waits_to_be_reopened_delays_no_other(tmp_path, monkeypatc
     assert (report.links["line"].openings, report.links["line"].state) == (1, LinkState.CLOSED)
 
 
+def test_a_source_that_a_blocked_stage_keeps_from_being_polled_is_reported_as_such(tmp_path, monkeypatch):
+    monkeypatch.setattr(PolledLine, "silent_after_s", 0.3)
+    monkeypatch.setattr("flow.live.live.STATUS_S", 0.05)
+    live = run_live(graph_of(tmp_path, SHARED.replace("Brittle", "Gate")))
+    live.nodes["line"].put(1)
+    gate = next(run for run in live._wiring.stages if run.stage.name == "brittle").stage._stage
+    assert gate._entered.wait(PATIENCE_S)
+    text = "line: is not read for 0.3 s: a stage in its thread computes for too long"
+    deadline_s = time.monotonic() + PATIENCE_S
+    while text not in [str(event) for event in live.report().events] and time.monotonic() < deadline_s:
+        time.sleep(0.02)
+    gate._open.set()
+    events = [str(event) for event in live.stop().events]
+    assert text in events
+    assert not [event for event in events if "cable" in event]
+
+
 def test_an_error_of_the_thread_itself_is_reported_and_closes_its_sources(tmp_path, monkeypatch):
     monkeypatch.setattr(SharedThread, "_poll", lambda *_: (_ for _ in ()).throw(OSError("no more files")))
     live = run_live(graph_of(tmp_path, SHARED))
@@ -110,7 +127,7 @@ def test_messages_of_another_thread_and_the_end_of_the_run_wake_a_waiting_thread
 @pytest.mark.parametrize(
     ("old", "new", "text"),
     [
-        ("PolledLine, thread: one, config", "Line, thread: one, config", "cannot share a thread"),
+        ("PolledLine, thread: one, config", "Line, thread: one, config", "Line needs a thread of its own"),
         ("Brittle, thread: one", "Brittle, thread: one, low_priority: true", "this source would pause with it"),
         ("PolledLine, thread: one}", "PolledLine, thread: 1}", "must be a name as stages have, got 1"),
     ],

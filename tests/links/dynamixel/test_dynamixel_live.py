@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from flow.link import LinkError
+from flow.link import LinkError, PolledRecords
 from links.clock import host_time
 from links.dynamixel import Servo, mx28
 from links.simulated.sensors.dynamixel_emulator import DynamixelEmulator
@@ -79,6 +79,7 @@ def test_states_are_stamped_when_the_servo_was_at_that_position(emulator):
     servo = live(emulator)
     host_ahead_ns = host_time.now_ns() - time.monotonic_ns()
     with servo.listen() as records:
+        assert isinstance(records, PolledRecords)
         moving = []
         for record, state in travel(servo, records, 150, 20):
             assert record.topic == "/servo/state"

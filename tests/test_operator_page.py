@@ -69,12 +69,11 @@ TEXTS = {  # source file and its texts
     "links/camera/live_camera.py": ["overtaken", "lost", "opened again"],
     "links/dynamixel/drive.py": ["the servo is not configured for grd: "],
     "links/dynamixel/worker.py": ["does not reply at"],
+    "links/dynamixel/readings.py": ["the servo process ended", "process restarts"],
     "links/dynamixel/servo.py": [
         "does not move: ",
         "it is set up again automatically",
-        "the servo process ended",
         "the servo is stopped",
-        "process restarts",
         "stops: no aim stage",
         "goals clamped to limits_deg",
         "goals clamped to speed_limit_rpm",

@@ -16,9 +16,11 @@ import numpy as np
 
 from stages.detect.flight import Motion, fit_motion, lamp_sway_m, moves, wire_sway_m
 from stages.detect.motion_log_ratios import DENIED, MotionLogRatios
-from stages.detect.trained.existence import LEAST_FALSE_PER_S, observed_nats, survived_nats
+from stages.detect.trained.existence import observed_nats, survived_nats
 from stages.geometry.frames import Array64
-from stages.kernels.detect.candidate import ACCELERATION_MPS2, SIGMA_M, neighbour_score
+from stages.kernels.detect.candidate import ACCELERATION_MPS2, SIGMA_M, neighbour_score, return_count_nats
+from stages.kernels.detect.existence import LEAST_FALSE_PER_S
+from stages.kernels.detect.first_observations import STATIC_M
 from stages.kernels.detect.isolation import SECTORS
 from stages.sums import sum_in_order
 
@@ -26,12 +28,7 @@ HISTORY = 40  # observations kept
 SAME_PASS_NS = 30_000_000  # observations this close in time belong to one scan pass
 FADING = 0.95  # a neighbour's weight is multiplied by this at each later observation,
 NEIGHBOUR_RADIUS_M = 2.0  # and does not count once the candidate is this far away: it does not hold the candidate
-SINGLE_RETURN_PER_M = 0.0165  # share of a drone's scan passes with a single return (few at close range), over range
-WIRE_SINGLE_RETURN = 0.75  # the same share for a wire
-FEW_RETURNS_M = 24.0  # over range: at most this many returns are few; a sixth of those of a beam across a 0.5 m drone
-SOME_RETURNS_M = 36.0  # over range: counts up to this one are ambiguous, a wire gives them, too
 SINGLE_RETURN_NATS = -1.0  # threshold of `Candidate.return_count_nats` below which `returns_singly` is true
-STATIC_M = 0.6  # a static object is observed again within this distance
 OPEN_NEIGHBOUR_SCORE = 0.5  # a lower `Candidate.neighbour_score` means open air around it
 START_SPEED_MPS = 6.0  # one sigma about the vehicle's own velocity
 
@@ -59,15 +56,6 @@ class Observation:
     rough_chords: int  # chords with enough returns to bulge smoothly that do not
     isolation: Array64  # (TALLY,) sector counts, see stages/detect/isolation.py
     large_object_m: float  # distance to the nearest large object; inf: none
-
-
-def return_count_nats(s: Observation) -> float:
-    """Log ratio of the number of returns of one scan pass, drone over wire [nats]."""
-    few = s.returns <= max(1.0, FEW_RETURNS_M / s.range_m)
-    if not few and s.returns <= SOME_RETURNS_M / s.range_m:
-        return 0.0
-    alone = min(max(SINGLE_RETURN_PER_M * s.range_m, 0.1), 0.7)
-    return math.log(alone / WIRE_SINGLE_RETURN) if few else math.log((1 - alone) / (1 - WIRE_SINGLE_RETURN))
 
 
 @dataclass(slots=True, eq=False)
@@ -163,7 +151,7 @@ class Candidate:
         self.observations += 1
         self.returns += s.returns
         self.too_long_passes += s.too_long
-        self.return_count_nats += return_count_nats(s)
+        self.return_count_nats += return_count_nats(s.returns, s.range_m)
         self.round_chords += s.round_chords
         self.rough_chords += s.rough_chords
         weight, measured = neighbour_score(s.isolation, self.free)

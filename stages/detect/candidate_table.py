@@ -11,6 +11,7 @@ import math
 from collections.abc import Iterable, Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stages.detect.candidate import Candidate, Observation
 from stages.detect.observations import Slice
@@ -75,6 +76,11 @@ class CandidateTable:
         found = nearest_rows(self._state, self._ns, self._reacquired, rows, s.stamp_ns, s.xyz_map_m)
         reacquired, other = (self._candidates[row] if row >= 0 else None for row in found)
         return reacquired, other
+
+    @property
+    def arrays(self) -> tuple[int, Array64, NDArray[np.int64], NDArray[np.bool_], int]:
+        """Time of the last promising observation, states, times, whether reacquired, and rows, as of `reject_first`."""
+        return self._promising_ns, self._state, self._ns, self._reacquired, len(self._candidates)
 
     def has_promising_since(self, stamp_ns: int) -> bool:
         """Whether a promising candidate may have been observed at this time or later."""

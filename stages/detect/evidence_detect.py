@@ -23,11 +23,12 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flow.stage import Settings, Stage
 from stages.cues.evidence import CueEvidence, CueWeights, ObjectPath, ObjectState
-from stages.detect.candidate import SAME_PASS_NS, START_SPEED_MPS, STATIC_M, Alternative, Candidate, Observation
+from stages.detect.candidate import SAME_PASS_NS, START_SPEED_MPS, Alternative, Candidate, Observation
 from stages.detect.candidate_messages import (
     Classified,
     candidate_log,
@@ -38,17 +39,27 @@ from stages.detect.candidate_messages import (
 from stages.detect.candidate_table import CandidateTable, positions_of
 from stages.detect.flight import scatter_m
 from stages.detect.isolation import LargeObjectMap
-from stages.detect.observations import ObservationFinder, ObservationLimits, Slice
+from stages.detect.observations import ObservationFinder, ObservationLimits, Observations, Slice
 from stages.detect.reacquire import reacquired_candidate, without_duplicates
 from stages.detect.telemetry import DetectorTelemetry
-from stages.detect.trained.existence import FalseReturns, birth_nats, passed_nats
-from stages.detect.trained.features import FREE_SPACE, features_of, first_features
+from stages.detect.trained.existence import FalseReturns, passed_nats
+from stages.detect.trained.features import FEATURES, FREE_SPACE, features_of
 from stages.detect.trained.model import ALTERNATIVES, LEAST_NATS, DetectorModel, Prediction, reasons_of
 from stages.geometry.frames import Array64
 from stages.geometry.rig_lidar import RigLidar
 from stages.geometry.trajectory import VehicleTrajectory
 from stages.kernels.detect.candidate import SIGMA_M
 from stages.kernels.detect.candidate_table import first_within
+from stages.kernels.detect.existence import birth_nats
+from stages.kernels.detect.first_observations import (
+    NEAR_REJECTED_M,
+    NEAR_REJECTED_NS,
+    NEAR_REJECTED_UNKNOWN_NS,
+    REVISITED_M,
+    STATIC_M,
+    reject_first,
+)
+from stages.kernels.detect.observations import X, Z
 from stages.kernels.sweep.pulses import cone_of
 from stages.messages import (
     CandidateLog,
@@ -66,14 +77,13 @@ from stages.sums import sum_in_order
 from stages.sweep.sweep import Travel
 
 PRUNE_PERIOD_NS = 84_300_000  # about twelve times a second
-NEAR_REJECTED_M = 1.5  # a rejected object this close,
-NEAR_REJECTED_NS = 20_000_000_000  # and this recent, makes a new candidate less probable
-REVISITED_M = 0.5  # the same position
 MAX_STATIC = 64  # static objects remembered
 # An accepted candidate is rejected this far below the threshold, by the LiDAR alone; for the sake of other candidates
 # only where they would be accepted in its place.
 HYSTERESIS_NATS = 1.65
 AT_REST_MPS = np.zeros(3)
+STATIC = ALTERNATIVES.index(Alternative.STATIC)
+ALL_FEATURES, WITHOUT_FREE_SPACE = np.empty(0, dtype=np.int64), np.array(FREE_SPACE)
 COMPARED_NS = 500_000_000  # a cue is compared with a candidate observed this recently,
 COMPARED_PASSES = 5  # in so many scan passes
 CUE_MARGIN_NATS = 0.5  # below the threshold of acceptance
@@ -217,8 +227,8 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
         if now_ns - now.pruned_ns > PRUNE_PERIOD_NS:
             now.pruned_ns = now_ns
             changed = self._prune(now, now_ns)
-        for observation in observations:
-            changed |= self._associate(now, observation)
+        if observations is not None:
+            changed |= self._associate_all(now, observations)
         if now.classified:
             yield candidate_log(now.classified.values(), now.trail, now_ns, now.detector_instance)
             now.classified.clear()
@@ -228,6 +238,40 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
         """Whether the vehicle's motion is known, so that static objects are static in the map frame."""
         return self.settings.parked or self._now.trail.known_at(stamp_ns)
 
+    def _associate_all(self, now: _State, observations: Observations) -> bool:
+        """Reject most observations in compiled calls, and associate the others. True: publish a change."""
+        stamps_ns = observations.stamps_ns.tolist()
+        known, moves = (
+            np.array([flag(stamp_ns) for stamp_ns in stamps_ns]) for flag in (self._motion_known, now.telemetry.moves)
+        )
+        changed, begin = False, 0
+        while begin < len(stamps_ns):
+            left = begin if now.cues.known else self._reject_first(now, observations, begin, known, moves)
+            if left < len(stamps_ns):
+                changed |= self._associate(now, observations.one(left))
+            begin = left + 1
+        return changed
+
+    def _reject_first(
+        self, now: _State, s: Observations, begin: int, known: NDArray[np.bool_], moves: NDArray[np.bool_]
+    ) -> int:
+        """Reject observations that are not promising and fit no candidate; the index of the first one that is left."""
+        n, settings = len(s.stamps_ns), self.settings
+        log_odds, alternatives, features = np.empty(n), np.empty(n, dtype=np.int64), np.empty((n, len(FEATURES)))
+        left = reject_first(
+            begin, s.stamps_ns, s.rows, known, moves, *now.table.arrays, now.static_m, *now.rejected_map.arrays,
+            *now.false_returns.arrays, *settings.model.tables(compared=False), settings.span_m, self._follow_up_nats,
+            ALL_FEATURES if settings.free_space else WITHOUT_FREE_SPACE, STATIC, log_odds, alternatives, features,
+        )  # fmt: skip
+        for k, nats, alternative in zip(
+            range(begin, left), log_odds[begin:left].tolist(), alternatives[begin:left].tolist(), strict=True
+        ):
+            now.number += 1
+            xyz_m, seen_ns = s.rows[k, X : Z + 1], int(s.stamps_ns[k])
+            now.classified[now.number] = Classified(now.number, seen_ns, xyz_m, nats, features[k])
+            now.rejected[ALTERNATIVES[alternative].value] += 1
+        return left
+
     def _associate(self, now: _State, s: Observation) -> bool:
         """Assign an observation to the candidate that it fits, or start a new one. True: publish a change."""
         reacquired, other = now.table.best_fits(s)
@@ -236,19 +280,14 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
         best = other or self._reactivate(now, s)
         if best is not None:
             return self._update(now, best, s) or reacquired is not None
-        since_ns = s.stamp_ns - (NEAR_REJECTED_NS if self._motion_known(s.stamp_ns) else NEAR_REJECTED_NS // 20)
-        rejected_m = now.rejected_map.nearest_m(s.xyz_map_m, 0.0, NEAR_REJECTED_M, since_ns)
+        memory_ns = NEAR_REJECTED_NS if self._motion_known(s.stamp_ns) else NEAR_REJECTED_UNKNOWN_NS
+        rejected_m = now.rejected_map.nearest_m(s.xyz_map_m, 0.0, NEAR_REJECTED_M, s.stamp_ns - memory_ns)
         near_rejected = math.isfinite(rejected_m)
         # under trees observations are frequent at any position, so that a reacquisition would be by chance
         if reacquired is None and not near_rejected and not math.isfinite(s.large_object_m):
             self._reacquire(now, s)
         now.number += 1
         false_per_s = now.false_returns.per_s(s.range_m, s.stamp_ns)
-        revisited = rejected_m < REVISITED_M and now.telemetry.moves(s.stamp_ns)
-        if self._rejected_at_once(
-            now, s, first_features(s, self.settings.span_m, false_per_s, near_rejected, revisited)
-        ):
-            return False
         new = Candidate(
             number=now.number,
             stamp_ns=s.stamp_ns,
@@ -262,7 +301,7 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
             false_per_s=false_per_s,
             existence_nats=birth_nats(false_per_s),
             near_rejected=near_rejected,
-            revisited=revisited,
+            revisited=rejected_m < REVISITED_M and now.telemetry.moves(s.stamp_ns),
         )
         new.add_observation(s)
         changed = self._classify(now, new)
@@ -272,17 +311,6 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
         else:
             self._reject(now, s, new.alternative)
         return changed
-
-    def _rejected_at_once(self, now: _State, s: Observation, features: Array64) -> bool:
-        """Reject a first observation by its features. False: it is promising, or other candidates or cues count."""
-        if now.cues.known or now.table.has_promising_since(s.stamp_ns):
-            return False
-        prediction = self._predict(features)
-        if prediction.log_odds >= self._follow_up_nats:
-            return False
-        now.classified[now.number] = Classified(now.number, s.stamp_ns, s.xyz_map_m, prediction.log_odds, features)
-        self._reject(now, s, ALTERNATIVES[prediction.alternative])
-        return True
 
     def _reject(self, now: _State, s: Observation, alternative: Alternative) -> None:
         """Count a rejected first observation, and remember its position if it is of a static object."""

@@ -11,6 +11,7 @@ from collections import Counter
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stages.detect.candidate import Observation
 from stages.detect.chords import ChordFinder
@@ -23,6 +24,8 @@ from stages.kernels.detect.observations import (
     RANGE,
     SMALL,
     TALLY_0,
+    X,
+    Z,
     group_chords,
     kinds_of,
     observe,
@@ -56,6 +59,30 @@ class ObservationLimits(NamedTuple):
     clear_m: float
 
 
+class Observations(NamedTuple):
+    """Observations of a slice, in order of time."""
+
+    stamps_ns: NDArray[np.int64]  # (k,)
+    rows: Array64  # (k, COLUMNS) as of `observe`
+    vehicle_map_m: Array64  # (k, 3) position of the vehicle
+
+    def one(self, k: int) -> Observation:
+        """Observation number k."""
+        range_m, large_object_m, returns, too_long, round_chords, rough = self.rows[k, RANGE:TALLY_0].tolist()
+        return Observation(
+            stamp_ns=int(self.stamps_ns[k]),
+            xyz_map_m=self.rows[k, X : Z + 1],
+            vehicle_map_m=self.vehicle_map_m[k],
+            range_m=range_m,
+            returns=int(returns),
+            too_long=bool(too_long),
+            round_chords=int(round_chords),
+            rough_chords=int(rough),
+            isolation=self.rows[k, TALLY_0:],
+            large_object_m=large_object_m,
+        )
+
+
 class _Chord(NamedTuple):
     stamp_ns: int  # middle
     last_ns: int  # last return
@@ -74,16 +101,16 @@ class ObservationFinder:
         self._waiting: list[_Chord] = []
         self.hidden: Counter[str] = Counter()  # short chords that were not free at both ends
 
-    def feed(self, slice_: Slice, trail: VehicleTrajectory, motion_known: bool) -> list[Observation]:
+    def feed(self, slice_: Slice, trail: VehicleTrajectory, motion_known: bool) -> Observations | None:
         """The observations that this slice completes, in order of time."""
         now_ns = int(slice_.pulses.point_stamp_ns[-1])
         self._recent.add(slice_.pulses, slice_.axis, slice_.half_rad, now_ns)
         self._find(slice_)
         if not self._waiting:
-            return []
+            return None
         ready = sorted((c for c in self._waiting if now_ns - c.last_ns >= DELAY_NS), key=lambda c: c.stamp_ns)
         self._waiting = [c for c in self._waiting if now_ns - c.last_ns < DELAY_NS]
-        return self._observations(ready, trail, motion_known) if ready else []
+        return self._observations(ready, trail, motion_known) if ready else None
 
     def _find(self, slice_: Slice) -> None:
         limits, pulses = self._limits, slice_.pulses
@@ -102,35 +129,17 @@ class ObservationFinder:
                 first_ns, last_ns = int(found.first_ns[i]), int(found.last_ns[i])
                 self._waiting.append(_Chord((first_ns + last_ns) // 2, last_ns, rows[i]))
 
-    def _observations(self, chords: list[_Chord], trail: VehicleTrajectory, motion_known: bool) -> list[Observation]:
+    def _observations(self, chords: list[_Chord], trail: VehicleTrajectory, motion_known: bool) -> Observations:
         """The observations of chords in order of time, one of each object."""
         limits, rows = self._limits, np.array([c.row for c in chords])
         groups = np.empty(len(rows), dtype=np.int64)
         count = group_chords(rows, 1.2 * limits.span_m, groups)
         numbers = groups.tolist()
-        stamps_ns = [chords[numbers.index(k)].stamp_ns for k in range(count)]
-        stamps = np.array(stamps_ns, dtype=np.int64)
-        R, t = trail.at_each(stamps)
-        since_ns = stamps - (MEMORY_NS if motion_known else SHORT_MEMORY_NS)
+        stamps_ns = np.array([chords[numbers.index(k)].stamp_ns for k in range(count)], dtype=np.int64)
+        R, t = trail.at_each(stamps_ns)
+        since_ns = stamps_ns - (MEMORY_NS if motion_known else SHORT_MEMORY_NS)
         found = observe(
             rows, groups, R, t, since_ns, limits.span_m, limits.clear_m, self._beam_spacing_rad,
             *self._recent.arrays, *self._large.arrays,
         )  # fmt: skip
-        positions_m, sectors = found[:, :3], found[:, TALLY_0:]
-        return [
-            Observation(
-                stamp_ns=stamp_ns,
-                xyz_map_m=positions_m[k],
-                vehicle_map_m=t[k],
-                range_m=range_m,
-                returns=int(returns),
-                too_long=bool(too_long),
-                round_chords=int(round_chords),
-                rough_chords=int(rough),
-                isolation=sectors[k],
-                large_object_m=large_object_m,
-            )
-            for k, (stamp_ns, (range_m, large_object_m, returns, too_long, round_chords, rough)) in enumerate(
-                zip(stamps_ns, found[:, RANGE:TALLY_0].tolist(), strict=True)
-            )
-        ]
+        return Observations(stamps_ns, found, t)

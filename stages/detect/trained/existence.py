@@ -21,14 +21,11 @@ import math
 
 import numpy as np
 
-SHELL_M = 4.0  # of the range histogram of false returns
-SHELLS = 32
-MEMORY_S = 6.0  # false returns count for this long (1 / e)
+from stages.kernels.detect.existence import SHELL_M, SHELLS, add_false_return, false_returns_per_s
+
 PASS_S = 0.1  # between scan passes: 600 rpm
 CERTAIN_NATS = 30.0  # limit of arithmetic
 LIFETIME_S = 30.0  # assumed mean time that an object stays in view
-BIRTHS_PER_S = 0.02  # assumed: one object appears in the sky in 50 s
-LEAST_FALSE_PER_S = 0.05  # false returns of a clear sky, per shell: the prior of the histogram
 RETURNS_AT_MIDDLE = 0.6  # of the pulses through the middle of a drone: assumed; the track estimates its own
 RETURNS_TO_M = 35.0  # a dark drone returns them to this range, fewer by the inverse square beyond
 
@@ -37,31 +34,16 @@ class FalseReturns:
     """Rate of observations that belong to no candidate, by range: false returns, rain drops, leaves, static objects."""
 
     def __init__(self) -> None:
-        self._count, self._stamp_ns = np.zeros(SHELLS), 0
+        self.arrays = np.zeros(SHELLS), np.zeros(1, dtype=np.int64)
+        """Faded number by range, and the time of the newest, as `add_false_return` takes them."""
 
     def add(self, range_m: float, stamp_ns: int) -> None:
         """Count one."""
-        self._fade(stamp_ns)
-        self._count[_shell(range_m)] += 1.0
+        add_false_return(*self.arrays, range_m, stamp_ns)
 
     def per_s(self, range_m: float, stamp_ns: int) -> float:
         """Rate [1/s] in the shell at this range, at least LEAST_FALSE_PER_S."""
-        fading = math.exp(-max(stamp_ns - self._stamp_ns, 0) * 1e-9 / MEMORY_S)
-        return LEAST_FALSE_PER_S + float(self._count[_shell(range_m)]) * fading / MEMORY_S
-
-    def _fade(self, stamp_ns: int) -> None:
-        if stamp_ns > self._stamp_ns:
-            self._count *= math.exp(-(stamp_ns - self._stamp_ns) * 1e-9 / MEMORY_S)
-            self._stamp_ns = stamp_ns
-
-
-def _shell(range_m: float) -> int:
-    return min(int(range_m / SHELL_M), SHELLS - 1)
-
-
-def birth_nats(false_per_s: float) -> float:
-    """Log-odds after the first observation; the volume cancels."""
-    return math.log(BIRTHS_PER_S / SHELLS / false_per_s)
+        return false_returns_per_s(*self.arrays, range_m, stamp_ns)
 
 
 def survived_nats(nats: float, dt_s: float) -> float:

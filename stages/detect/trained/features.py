@@ -21,17 +21,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stages.detect.candidate import Candidate, Observation, return_count_nats
+from stages.detect.candidate import Candidate
 from stages.detect.flight import Motion, straight_flight
 from stages.detect.motion_log_ratios import MotionLogRatios
-from stages.detect.trained.existence import birth_nats
 from stages.geometry.frames import Array64
-from stages.kernels.detect.candidate import neighbour_score
-from stages.kernels.detect.isolation import SECTORS
+from stages.kernels.detect.first_observations import NONE_M, PULSE_RAD
 
 VERSION = 8
-PULSE_RAD = math.radians(0.2)  # between two pulses of a laser: VLP-16, 600 rpm
-NONE_M = 4.0  # written where no large object is near
 WIRE_M, SINGLE_RETURN_WIRE_M = 20.0, 30.0  # to these ranges a wire returns pulses; several a scan pass, and one
 NOT_DISPLACED_NATS = 3.0  # cap of the log ratio over a static object that may seem to move as far
 
@@ -95,7 +91,7 @@ NO_IMU = NO_TELEMETRY[1:]
 
 
 def features_of(c: Candidate, span_m: float, motion_known: bool) -> Array64:
-    """Features (len(FEATURES),) of a candidate; NaN: not available.
+    """Features (len(FEATURES),) of a candidate; NaN: not available. `first_features` gives those of one observation.
 
     `span_m`: of the drone; `motion_known`: whether positions in frame map are those over ground.
     """
@@ -136,47 +132,6 @@ def features_of(c: Candidate, span_m: float, motion_known: bool) -> Array64:
             since,
             *telemetry,
             *(NO_IMU if imu is None else imu[:3]),
-        ],
-        dtype=np.float64,
-    )
-
-
-def first_features(s: Observation, span_m: float, false_per_s: float, near_rejected: bool, revisited: bool) -> Array64:
-    """`features_of` a candidate with a single observation. Most are rejected at once, and need no candidate."""
-    counted = np.zeros(SECTORS)
-    occupied, measured = neighbour_score(s.isolation, counted)
-    free = counted.tolist()
-    return np.array(
-        [
-            s.range_m,
-            birth_nats(false_per_s),
-            false_per_s,
-            1.0,
-            s.returns,
-            s.returns * PULSE_RAD * s.range_m / span_m,
-            return_count_nats(s),
-            sum([times >= 1.0 for times in free]),
-            min(free),
-            occupied,
-            measured and occupied == 0.0,
-            min(s.large_object_m, NONE_M),
-            math.isfinite(s.large_object_m),
-            s.too_long,
-            (s.rough_chords + 1.0) / (s.round_chords + s.rough_chords + 2.0),
-            math.nan,
-            math.nan,
-            0.0,
-            0.0,
-            math.nan,
-            0.0,
-            math.nan,
-            math.nan,
-            False,
-            near_rejected,
-            revisited,
-            math.nan,
-            *NO_TELEMETRY,
-            *NO_IMU,
         ],
         dtype=np.float64,
     )

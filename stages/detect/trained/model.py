@@ -81,8 +81,12 @@ class DetectorModel(StrictModel):
             raise ValueError(f"priors: there are {len(ALTERNATIVES)} alternatives")
         return self
 
+    def tables(self, compared: bool) -> tuple[NDArray[np.int64], Array64, Array64, Array64, Array64]:
+        """The first arguments of `evaluate`, for a candidate that is compared with telemetry or not."""
+        return *self._terms, self._priors[int(compared)]
+
     @cached_property
-    def _tables(self) -> tuple[NDArray[np.int64], Array64, Array64, Array64]:
+    def _terms(self) -> tuple[NDArray[np.int64], Array64, Array64, Array64]:
         """(alternative, feature, knots) (terms, 3); knots, values (terms, most); missing (terms,)."""
         most = max(len(term.knots) for term in self.terms)
         where = [(term.alternative, NAMES.index(term.feature), len(term.knots)) for term in self.terms]
@@ -99,8 +103,7 @@ class DetectorModel(StrictModel):
 
     def predict(self, features: Array64) -> Prediction:
         """Log-odds of a drone for features (len(FEATURES),)."""
-        compared = not math.isnan(features[TELEMETRY])
-        return Prediction(*evaluate(*self._tables, self._priors[int(compared)], features))
+        return Prediction(*evaluate(*self.tables(not math.isnan(features[TELEMETRY])), features))
 
 
 def reasons_of(features: Array64, prediction: Prediction) -> str:

@@ -53,7 +53,7 @@ def count_sectors(
             continue
         a = R * (dx * ax + dy * ay) / along
         b = R * (dx * bx + dy * by + dz * bz) / along
-        away = math.hypot(a, b)
+        away = math.sqrt(a * a + b * b)
         if away > outer_m:
             continue
         r = range_m[i]
@@ -68,13 +68,25 @@ def count_sectors(
             else:
                 tally[INNER_PASSES] += 1
         elif away >= inner_m and (hit or away <= close_m):
-            sector = int((math.atan2(b, a) + math.pi) / (2 * math.pi) * SECTORS) % SECTORS
+            sector = _sector(a, b)
             if hit and away <= close_m:
                 tally[OCCUPIED_0 + sector] += 1
             elif hit:
                 tally[FARTHER_0 + sector] += 1
             else:
                 tally[FREE_0 + sector] += 1
+
+
+@compiled
+def _sector(a: float, b: float) -> int:
+    """Number of the sector of 45 deg with a direction a, b, from that of -a to -b and on."""
+    if b < 0.0:
+        if a < 0.0:
+            return 0 if b > a else 1
+        return 2 if -b > a else 3
+    if a > 0.0:
+        return 4 if b < a else 5
+    return 6 if b > -a else 7
 
 
 @compiled

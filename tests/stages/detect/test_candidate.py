@@ -7,18 +7,16 @@ import math
 import numpy as np
 import pytest
 
-from stages.detect.candidate import (
-    FADING,
+from stages.detect.candidate import FADING, Candidate, Observation
+from stages.detect.motion_log_ratios import DENIED, MotionLogRatios
+from stages.kernels.detect.candidate import (
     FEW_RETURNS_M,
+    OPEN_PASSES,
     SINGLE_RETURN_PER_M,
     SOME_RETURNS_M,
-    STATIC_M,
     WIRE_SINGLE_RETURN,
-    Candidate,
-    Observation,
 )
-from stages.detect.motion_log_ratios import DENIED, MotionLogRatios
-from stages.kernels.detect.candidate import OPEN_PASSES
+from stages.kernels.detect.first_observations import STATIC_M
 from stages.kernels.detect.isolation import FARTHER_0, FREE_0, OCCUPIED_0, TALLY
 from tests.stages.made import START_NS
 

@@ -21,11 +21,12 @@ from links.evaluation.stage_metrics import PROBABILITY_EDGES
 from stages.detect import EvidenceDetect
 from stages.detect.candidate import Alternative, Observation
 from stages.detect.candidate_messages import detections_message, log_odds_of
-from stages.detect.evidence_detect import HYSTERESIS_NATS, NEAR_REJECTED_M, NEAR_REJECTED_NS, STATIC_NS
+from stages.detect.evidence_detect import HYSTERESIS_NATS, STATIC_NS
 from stages.detect.trained.features import NAMES, VERSION
 from stages.detect.trained.model import DetectorModel, Prediction
 from stages.geometry.frames import rotation_from_rpy_deg, rotation_z
 from stages.geometry.trajectory import VehicleTrajectory
+from stages.kernels.detect.first_observations import NEAR_REJECTED_M, NEAR_REJECTED_NS
 from stages.kernels.detect.isolation import FREE_0, SECTORS, TALLY
 from stages.messages import (
     CandidateEvidence,

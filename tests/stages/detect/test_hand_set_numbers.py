@@ -8,7 +8,7 @@ from pathlib import Path
 import stages.detect
 
 NO_CHOICE = {0, 1, 2, 3, 0.5, 100, 500, 1e3, 1e6, 1e9, 1e-3, 1e-9, 1e-12, 1e18}  # counts, units, limits of arithmetic
-MOST = 128
+MOST = 111
 
 
 def hand_set(text: str) -> list[float]:

@@ -10,16 +10,15 @@ import pytest
 
 from stages.detect.flight import lamp_sway_m
 from stages.detect.motion_log_ratios import MotionLogRatios
-from stages.detect.trained.existence import birth_nats
 from stages.detect.trained.features import (
     FEATURES,
     NAMES,
     NOT_DISPLACED_NATS,
-    PULSE_RAD,
     features_of,
-    first_features,
 )
 from stages.geometry.frames import rotation_z
+from stages.kernels.detect.existence import birth_nats
+from stages.kernels.detect.first_observations import PULSE_RAD, first_features
 from stages.kernels.detect.isolation import FREE_0, SECTORS, TALLY
 from tests.stages.detect.test_candidate import PLACE_M, candidate, observation, path
 
@@ -63,7 +62,10 @@ def test_the_features_of_a_first_observation_need_no_candidate(seed):
     c = candidate(first)
     c.false_per_s, c.existence_nats = false_per_s, birth_nats(false_per_s)
     c.near_rejected, c.revisited = near_rejected, revisited
-    alone = first_features(first, 0.5, false_per_s, near_rejected, revisited)
+    returned = (first.range_m, first.large_object_m, first.returns, first.too_long)
+    row = np.array([*first.xyz_map_m, *returned, first.round_chords, first.rough_chords, *first.isolation], dtype=float)
+    alone = np.empty(len(FEATURES))
+    first_features(row, 0.5, false_per_s, near_rejected, revisited, alone)
     np.testing.assert_array_equal(alone, features_of(c, 0.5, True))
 
 

@@ -7,16 +7,13 @@ import math
 import pytest
 
 from stages.detect.trained.existence import (
-    LEAST_FALSE_PER_S,
     LIFETIME_S,
-    MEMORY_S,
-    SHELL_M,
     FalseReturns,
-    birth_nats,
     observed_nats,
     passed_nats,
     survived_nats,
 )
+from stages.kernels.detect.existence import LEAST_FALSE_PER_S, MEMORY_S, SHELL_M, birth_nats
 
 START_NS = 1_000_000_000
 

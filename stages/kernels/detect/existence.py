@@ -1,0 +1,47 @@
+"""Compiled functions of a candidate's existence: the rate of false returns by range, and the log-odds of a birth.
+
+Source: see `stages/detect/trained/existence.py`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.geometry.frames import Array64
+from stages.kernels.compiled import compiled
+
+SHELL_M = 4.0  # of the range histogram of false returns
+SHELLS = 32
+MEMORY_S = 6.0  # false returns count for this long (1 / e)
+BIRTHS_PER_S = 0.02  # assumed: one object appears in the sky in 50 s
+LEAST_FALSE_PER_S = 0.05  # false returns of a clear sky, per shell: the prior of the histogram
+
+
+@compiled
+def _shell(range_m: float) -> int:
+    return min(int(range_m / SHELL_M), SHELLS - 1)
+
+
+@compiled
+def add_false_return(count: Array64, newest_ns: NDArray[np.int64], range_m: float, stamp_ns: int) -> None:
+    """Count one in the faded histogram count (SHELLS,), as of newest_ns (1,)."""
+    if stamp_ns > newest_ns[0]:
+        count *= math.exp(-(stamp_ns - newest_ns[0]) * 1e-9 / MEMORY_S)
+        newest_ns[0] = stamp_ns
+    count[_shell(range_m)] += 1.0
+
+
+@compiled
+def false_returns_per_s(count: Array64, newest_ns: NDArray[np.int64], range_m: float, stamp_ns: int) -> float:
+    """Rate [1/s] in the shell at this range, at least LEAST_FALSE_PER_S; see `add_false_return`."""
+    fading = math.exp(-max(stamp_ns - newest_ns[0], 0) * 1e-9 / MEMORY_S)
+    return LEAST_FALSE_PER_S + count[_shell(range_m)] * fading / MEMORY_S
+
+
+@compiled
+def birth_nats(false_per_s: float) -> float:
+    """Log-odds after the first observation; the volume cancels."""
+    return math.log(BIRTHS_PER_S / SHELLS / false_per_s)

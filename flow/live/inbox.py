@@ -128,6 +128,8 @@ class Inbox:
 
     def take(self) -> Item | None:
         """The queued message that was put first; None: no message is queued."""
+        if not any(self._ports):  # most often; only the caller takes, so it needs no lock
+            return None
         with self._changed:
             queue = self._first()
             return None if queue is None else queue.popleft()
@@ -171,9 +173,8 @@ class Inbox:
 
     @property
     def done(self) -> bool:
-        """Whether it is closed and empty."""
-        with self._changed:
-            return self._closed and not any(self._ports)
+        """Whether it is closed and empty. Nothing is put after it has closed, so this needs no lock."""
+        return self._closed and not any(self._ports)
 
     def waiting(self, port: int) -> int:
         """Number of queued messages of a port."""

@@ -48,6 +48,7 @@ class SupervisedStage:
         self._failed_ns: deque[int] = deque(maxlen=MAX_RESTARTS)
         self._replaced_counters = Counters()
         self._stage = build(spec)
+        self._handlers: dict[str, tuple[str, Callable[[Any], Any]]] = {}  # of the stage, with its name, by port
 
     @property
     def counters(self) -> Counters:
@@ -57,7 +58,10 @@ class SupervisedStage:
     def take(self, port: str, message: Message, arrival_ns: int) -> list[tuple[Output[Any], Message]]:
         """What the stage gives for one message, each with its output; nothing when it raises."""
         self.last_ns = max(self.last_ns, arrival_ns)
-        return self._guarded(f"{self.name}.{port}", getattr(self._stage, f"on_{port}"), message, arrival_ns)
+        handler = self._handlers.get(port)
+        if handler is None:
+            handler = self._handlers[port] = f"{self.name}.{port}", getattr(self._stage, f"on_{port}")
+        return self._guarded(*handler, message, arrival_ns)
 
     def finish(self) -> list[tuple[Output[Any], Message]]:
         """What the stage gives at the end of the run; it takes nothing afterwards."""
@@ -90,4 +94,5 @@ class SupervisedStage:
             self.restarts += 1
             self._replaced_counters += Counters.of(self._stage.counters)
             self._stage = self._build(self._spec)
+            self._handlers.clear()
             self._report(f"{self.name} restarts", error)

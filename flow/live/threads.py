@@ -5,7 +5,9 @@ Source: ours.
 
 from __future__ import annotations
 
+import math
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -27,6 +29,7 @@ from flow.taps import Digest
 WAIT_S = 0.2  # the longest wait of a stage's thread, which then checks whether the run has stopped
 SENT_S = 0.05  # interval at which a sink's own records are fetched
 TAP_S = 0.05  # interval at which a tap takes its messages: a wakeup for each would cost more than the message
+RESTING_MS = 1000.0  # so does a stage's thread if no deadline of its inputs is shorter than this
 
 
 class Feed(NamedTuple):
@@ -102,6 +105,11 @@ class StageRun:
         if self.stage.switched_off:
             self.end()
 
+    @property
+    def deadline_ms(self) -> float:
+        """The shortest of its inputs."""
+        return min((count.edge.queue.deadline_ms for _, count in self._ports), default=math.inf)
+
     def takes_newest(self, port: int) -> bool:
         """Whether only the newest message waits there, as of images."""
         return self._ports[port][1].edge.queue.policy == "latest"
@@ -131,11 +139,19 @@ class StageThread(RunThread):
         self.stages, self._wakeup, self._throttle = stages, wakeup, throttle
         self._inboxes = [stage.inbox for stage in stages]
         self._running = stages[::-1]
+        self._rests = min((stage.deadline_ms for stage in stages), default=0.0) >= RESTING_MS
 
     def run(self) -> None:
         while self._running:
             if not self.step():
-                self._wakeup.wait(self._inboxes, WAIT_S)
+                self.wait()
+
+    def wait(self) -> None:
+        """Wait for messages."""
+        if self._rests:
+            time.sleep(TAP_S)
+        else:
+            self._wakeup.wait(self._inboxes, WAIT_S)
 
     def step(self) -> bool:
         """One message of one stage. False: no message is queued."""

@@ -38,9 +38,9 @@ from stages.heading.inertial_state import (
     THETA,
     VELOCITY,
     InertialState,
-    exp_rotations,
-    log_rotations,
 )
+from stages.kernels.geometry.so3 import exp_rotation
+from stages.kernels.heading.moments import moments as compiled_moments
 
 STARTS, MOST = 12, 24
 START_TILT_RAD = math.radians(3.0)  # of the autopilot's roll and pitch
@@ -232,7 +232,7 @@ def level(up_drone: Array64) -> Array64:
     sin = math.hypot(x, y)
     if sin < 1e-9:
         return np.eye(3)
-    return exp_rotations(phi[None] * (math.atan2(sin, z) / sin))[0]
+    return exp_rotation(phi * (math.atan2(sin, z) / sin))
 
 
 def joined(states: list[InertialState]) -> InertialState:
@@ -248,17 +248,7 @@ def joined(states: list[InertialState]) -> InertialState:
 
 def moments(state: InertialState, weight: Array64) -> InertialState:
     """One hypothesis (1 row) with the mean and covariance of several; weight (n,) sums to 1."""
-    base = int(np.argmax(weight))
-    off = np.zeros((len(state), SIZE))
-    off[:, THETA] = log_rotations(np.swapaxes(state.R[base : base + 1], 1, 2) @ state.R)
-    off[:, POSITION] = state.xyz_m - state.xyz_m[base]
-    off[:, VELOCITY] = state.velocity_mps - state.velocity_mps[base]
-    off[:, 9:] = state.bias - state.bias[base]
-    mean = weight @ off
-    spread = off - mean
-    P = np.einsum("n,nij->ij", weight, state.covariance) + np.einsum("n,ni,nj->ij", weight, spread, spread)
-    one = state.rows(np.array([base]))
-    return InertialState(one.R, one.xyz_m, one.velocity_mps, one.bias, P[None]).moved(mean[None])
+    return InertialState(*(one[None] for one in compiled_moments(*state.contiguous(), weight)))
 
 
 def log_normal(d2: Array64, S: Array64) -> Array64:

@@ -56,6 +56,12 @@ class InertialState:
     def __len__(self) -> int:
         return len(self.xyz_m)
 
+    def contiguous(self) -> tuple[Array64, Array64, Array64, Array64, Array64]:
+        """All arrays, as compiled functions take them."""
+        arrays = self.R, self.xyz_m, self.velocity_mps, self.bias, self.covariance
+        R, xyz_m, velocity_mps, bias, covariance = map(np.ascontiguousarray, arrays)
+        return R, xyz_m, velocity_mps, bias, covariance
+
     def rows(self, index: NDArray[np.intp]) -> InertialState:
         """The hypotheses of an index array."""
         return InertialState(
@@ -122,11 +128,7 @@ def predict(state: InertialState, imu: ImuIntervals, weight: Array64) -> Inertia
     walk = np.zeros(SIZE)
     walk[ACCEL_BIAS], walk[GYRO_BIAS] = ACCEL_WALK**2 * T, GYRO_WALK**2 * T
     moved = predict_states(
-        np.ascontiguousarray(state.R),
-        np.ascontiguousarray(state.xyz_m),
-        np.ascontiguousarray(state.velocity_mps),
-        np.ascontiguousarray(state.bias),
-        np.ascontiguousarray(state.covariance),
+        *state.contiguous(),
         *(dR, dv, dp, J, C, mean, T, GRAVITY_MPS2, walk),
     )
     return InertialState(*moved[:3], state.bias, moved[3])

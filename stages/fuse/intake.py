@@ -7,6 +7,7 @@ Source: ours.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 
 import numpy as np
@@ -33,7 +34,7 @@ class Intake:
 
     def is_valid(self, message: Message, what: str, *numbers: Array64) -> bool:
         """Whether a message is finite and its stamp plausible."""
-        if not all(np.isfinite(v).all() for v in numbers):
+        if not all(all(map(math.isfinite, v.ravel().tolist())) for v in numbers):  # small arrays
             self.rejected[f"{what}: not finite"] += 1
             return False
         if self.now_ns is not None and message.stamp_ns > self.now_ns + AHEAD_NS and self._ahead < MAX_REJECTED_STAMPS:

@@ -37,19 +37,25 @@ class Pulses(NamedTuple):
 
 
 @compiled
-def angle_at(t_ns: int, state_ns: NDArray[np.int64], state_rad: Array64, max_gap_ns: int) -> float:
-    """Angle at a time, interpolated between the neighbouring states; NaN outside them or in a gap."""
+def angle_at(
+    t_ns: int, state_ns: NDArray[np.int64], state_rad: Array64, max_gap_ns: int, after: int
+) -> tuple[float, int]:
+    """Angle at a time, interpolated between the neighbouring states, and the index of the first not before that time.
+
+    NaN outside the states or in a gap. `after`: that index for a time shortly before; any is right.
+    """
     n = state_ns.size
     if n == 0 or t_ns < state_ns[0] or t_ns > state_ns[n - 1]:
-        return math.nan
-    after = np.searchsorted(state_ns, t_ns)  # state_ns[after - 1] < t_ns <= state_ns[after]
+        return math.nan, after
+    if not (0 < after < n and state_ns[after - 1] < t_ns <= state_ns[after]):
+        after = np.searchsorted(state_ns, t_ns)
     if state_ns[after] == t_ns:
-        return state_rad[after]
+        return state_rad[after], after
     gap_ns = state_ns[after] - state_ns[after - 1]
     if gap_ns > max_gap_ns:
-        return math.nan
+        return math.nan, after
     share = (t_ns - state_ns[after - 1]) / gap_ns
-    return state_rad[after - 1] + share * (state_rad[after] - state_rad[after - 1])
+    return state_rad[after - 1] + share * (state_rad[after] - state_rad[after - 1]), after
 
 
 @compiled
@@ -57,8 +63,9 @@ def turns_at(
     pulse_ns: NDArray[np.int64], state_ns: NDArray[np.int64], state_rad: Array64, max_gap_ns: int, turn: Array64
 ) -> None:
     """Fill turn (n, 3) with angle, cosine and sine at each pulse; NaN where the angle is not known."""
+    after = 0
     for i in range(pulse_ns.size):
-        angle = angle_at(pulse_ns[i], state_ns, state_rad, max_gap_ns)
+        angle, after = angle_at(pulse_ns[i], state_ns, state_rad, max_gap_ns, after)
         turn[i, 0], turn[i, 1], turn[i, 2] = angle, math.cos(angle), math.sin(angle)
 
 

@@ -3,6 +3,8 @@
 A laser fires every 0.1 to 0.4 deg along its cone. A chord ends where the next pulses return nothing or something
 farther (the end is free), or something nearer (the end is hidden). A drone gives chords that are short and free at both
 ends; walls, ground and trunks give long ones. A chord is reported as soon as it has ended or is longer than any drone.
+A chord ends once the beam is a hole's width past it. That is many pulses beside a near object, as a rain drop, and
+farther returns among them are of chords of their own.
 
 Source: ours; DESIGN, "free-space evidence ... evaluated as data arrives".
 """
@@ -17,7 +19,7 @@ from numpy.typing import NDArray
 
 from stages.geometry.frames import Array64
 from stages.geometry.lidar_models import LidarProfile
-from stages.kernels.detect.chords import BEFORE, MEMORY, find_chords
+from stages.kernels.detect.chords import DEPTHS, MEMORY, find_chords
 from stages.messages import SweptPulses
 
 COLUMNS = 14
@@ -40,13 +42,13 @@ class ChordFinder:
         """`longest_m`: longer chords are no drone. A range step of `jump_m` or a gap of `hole_m` ends a chord."""
         self._longest_m, self._jump_m, self._hole_m = longest_m, jump_m, hole_m
         self._gap_ns = round(GAP_SEQUENCES * profile.sequence_ns)
-        self._open = np.zeros((profile.lasers, MEMORY))
-        self._open[:, BEFORE] = math.nan
-        self._times = np.zeros((profile.lasers, 3), dtype=np.int64)
+        self._open = np.zeros((profile.lasers, DEPTHS, MEMORY))
+        self._times = np.zeros((profile.lasers, DEPTHS, 2), dtype=np.int64)
+        self._newest = np.zeros(profile.lasers, dtype=np.int64), np.full(profile.lasers, math.nan)
 
     def feed(self, pulses: SweptPulses) -> Chords:
         """The chords that ended, or became too long, in this slice."""
-        n = pulses.range_m.size
+        n = pulses.range_m.size + self._times[..., 0].size
         rows, times = np.empty((n, COLUMNS)), np.empty((n, 2), dtype=np.int64)
         count = find_chords(
             pulses.point_stamp_ns,
@@ -61,6 +63,7 @@ class ChordFinder:
             self._gap_ns,
             self._open,
             self._times,
+            self._newest,
             rows,
             times,
         )

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from stages.geometry.frames import Array64
 from stages.kernels.compiled import compiled
 
-# State of an open chord, a row per laser.
+# State of an open chord.
 (
     HITS,  # 0: no chord is open
     SUM_X, SUM_Y, SUM_Z,  # of its points [m]
@@ -26,15 +26,17 @@ from stages.kernels.compiled import compiled
     HOLES,  # pulses between hits that were no hits
     FREE_BEFORE,  # 1: the pulse before the first went farther or returned nothing
     LONG_REPORTED,  # 1: too long, already reported
-    BEFORE,  # range of the laser's last pulse [m]; inf: nothing, NaN: not known
     U1, U2, U3, U4,  # sums of powers of u, the displacement across the line of sight since the first hit [m]
     R1, RU1, RU2, R2,  # and with r, the range over the first hit's [m]
     FIRST_RANGE,
     MEMORY,
-) = range(29)  # fmt: skip
+) = range(28)  # fmt: skip
 # Columns of the result.
 X, Y, Z, RANGE, LENGTH, DEPTH, COUNT, GAPS, SHADE, FREE, LASER, LONG, BULGE, ROUGH = range(14)
-FIRST, LAST, NEWEST = range(3)  # times per laser: its open chord's first and last hit, its newest pulse
+FIRST, LAST = range(2)  # times of an open chord's first and last hit
+# Open chords of a laser, each farther than the one before: until a beam is a hole's width past a rain drop at 1 m, it
+# moves by 17 deg and crosses farther objects. Memory for rain of 5 mm/h, in which one drop is open on average.
+DEPTHS = 4
 
 
 @compiled
@@ -102,6 +104,30 @@ def _add_to_profile(m: Array64, r: float, u2: float) -> None:
 
 
 @compiled
+def _end_from(
+    depth: int,
+    laser: int,
+    memory: Array64,
+    times: NDArray[np.int64],
+    rows: Array64,
+    row_ns: NDArray[np.int64],
+    count: int,
+) -> int:
+    """End a laser's chords from this depth on, as something hides how they continue; returns the new count of rows.
+
+    One that at least two pulses had gone past before had ended there.
+    """
+    for d in range(depth, DEPTHS):
+        m = memory[laser, d]
+        if m[HITS] > 0.0:
+            _write_chord(m, m[MISSED] >= 2.0, laser, m[LONG_REPORTED] > 0.0, rows[count])
+            row_ns[count] = times[laser, d]
+            count += 1
+            m[HITS] = 0.0
+    return count
+
+
+@compiled
 def find_chords(
     stamp_ns: NDArray[np.int64],
     direction: NDArray[np.float32],
@@ -115,28 +141,32 @@ def find_chords(
     gap_ns: int,
     memory: Array64,
     times: NDArray[np.int64],
+    newest: tuple[NDArray[np.int64], Array64],
     rows: Array64,
     row_ns: NDArray[np.int64],
 ) -> int:
-    """Continue each laser's chord, pulse by pulse; fill rows and times of the completed chords, return their count."""
+    """Continue each laser's chords, pulse by pulse; fill rows and times of the completed chords, return their count.
+
+    memory (lasers, DEPTHS, MEMORY), times (lasers, DEPTHS, 2): the open chords. newest: time and range [m] of each
+    laser's last pulse; inf: nothing, NaN: not known.
+    """
     count = 0
+    newest_ns, before_m = newest
     point, before = np.empty(3), np.empty(3)
     for i in range(range_m.size):
         k = laser[i]
-        m = memory[k]
         r = float(range_m[i])
         seen = r > 0.0
-        ended = False
-        if stamp_ns[i] - times[k, NEWEST] > gap_ns:
-            if m[HITS] > 0.0:  # its continuation is unknown
-                _write_chord(m, m[MISSED] >= 2.0, k, m[LONG_REPORTED] > 0.0, rows[count])
-                row_ns[count, 0], row_ns[count, 1] = times[k, FIRST], times[k, LAST]
-                count += 1
-                m[HITS] = 0.0
-            m[BEFORE] = math.nan
-        times[k, NEWEST] = stamp_ns[i]
-        if m[HITS] > 0.0:
-            if seen and abs(r - m[LAST_RANGE]) <= jump_m:
+        if stamp_ns[i] - newest_ns[k] > gap_ns:
+            count = _end_from(0, k, memory, times, rows, row_ns, count)
+            before_m[k] = math.nan
+        newest_ns[k] = stamp_ns[i]
+        depth, begins = 0, seen  # begins: whether a chord begins with this return
+        while depth < DEPTHS and memory[k, depth, HITS] > 0.0:
+            m = memory[k, depth]
+            if seen and r - m[LAST_RANGE] < -jump_m:  # something nearer hides its continuation
+                break
+            if seen and r - m[LAST_RANGE] <= jump_m:
                 m[HOLES] += m[MISSED]
                 m[MISSED] = 0.0
                 for axis in range(3):
@@ -152,35 +182,39 @@ def find_chords(
                 m[LAST_RANGE] = r
                 m[LEAST_RANGE] = min(m[LEAST_RANGE], r)
                 m[MOST_RANGE] = max(m[MOST_RANGE], r)
-                times[k, LAST] = stamp_ns[i]
+                times[k, depth, LAST] = stamp_ns[i]
                 if across2 > longest_m * longest_m:  # a wall: reported in parts
                     _write_chord(m, False, k, True, rows[count])
-                    row_ns[count, 0], row_ns[count, 1] = times[k, FIRST], times[k, LAST]
+                    row_ns[count] = times[k, depth]
                     count += 1
                     m[LONG_REPORTED] = 1.0
                     for axis in range(3):
                         m[SUM_X + axis] = point[axis]
                         m[FIRST_X + axis] = point[axis]
                     _begin(m, r, reflectivity[i])
-                    times[k, FIRST] = stamp_ns[i]
-            elif seen and r < m[LAST_RANGE]:  # something nearer hides its continuation, unless it had ended before
-                _write_chord(m, m[MISSED] >= 2.0, k, m[LONG_REPORTED] > 0.0, rows[count])
-                ended = True
-            else:
-                m[MISSED] += 1.0
-                # how far the beam has moved away from the last hit, at the chord's range
-                away2 = 0.0
-                for axis in range(3):
-                    before[axis] = m[LAST_X + axis] - origin_m[axis]
-                    away2 += (m[LAST_RANGE] * direction[i, axis] - before[axis]) ** 2
-                if m[MISSED] >= 2.0 and away2 > hole_m * hole_m:
-                    _write_chord(m, True, k, m[LONG_REPORTED] > 0.0, rows[count])
-                    ended = True
-            if ended:
-                row_ns[count, 0], row_ns[count, 1] = times[k, FIRST], times[k, LAST]
+                    times[k, depth, FIRST] = stamp_ns[i]
+                begins = False
+                count = _end_from(depth + 1, k, memory, times, rows, row_ns, count)
+                break
+            m[MISSED] += 1.0
+            # how far the beam has moved away from the last hit, at the chord's range
+            away2 = 0.0
+            for axis in range(3):
+                before[axis] = m[LAST_X + axis] - origin_m[axis]
+                away2 += (m[LAST_RANGE] * direction[i, axis] - before[axis]) ** 2
+            if m[MISSED] >= 2.0 and away2 > hole_m * hole_m:
+                _write_chord(m, True, k, m[LONG_REPORTED] > 0.0, rows[count])
+                row_ns[count] = times[k, depth]
                 count += 1
-                m[HITS] = 0.0
-        if m[HITS] == 0.0 and seen:
+                for d in range(depth, DEPTHS - 1):
+                    memory[k, d] = memory[k, d + 1]
+                    times[k, d] = times[k, d + 1]
+                memory[k, DEPTHS - 1, HITS] = 0.0
+            else:
+                depth += 1
+        if begins and depth < DEPTHS:  # nearer than the chords from this depth on
+            count = _end_from(depth, k, memory, times, rows, row_ns, count)
+            m = memory[k, depth]
             for axis in range(3):
                 point[axis] = origin_m[axis] + r * direction[i, axis]
                 m[SUM_X + axis] = point[axis]
@@ -188,7 +222,7 @@ def find_chords(
                 m[LAST_X + axis] = point[axis]
             _begin(m, r, reflectivity[i])
             m[MISSED], m[LONG_REPORTED] = 0.0, 0.0
-            m[FREE_BEFORE] = 1.0 if m[BEFORE] > r + jump_m else 0.0
-            times[k, FIRST] = times[k, LAST] = stamp_ns[i]
-        m[BEFORE] = r if seen else math.inf
+            m[FREE_BEFORE] = 1.0 if before_m[k] > r + jump_m else 0.0
+            times[k, depth] = stamp_ns[i]
+        before_m[k] = r if seen else math.inf
     return count

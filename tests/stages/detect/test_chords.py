@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from stages.detect.chords import ChordFinder
 from stages.geometry.lidar_models import lidar_profile
 from stages.kernels.detect import chords as chord
 from stages.messages import SweptPulses
-from tests.stages.caster import Ball, Box, Wire, cast, flying, pulses_seen, still, sweeping
+from tests.stages.caster import Ball, Box, Wire, cast, dithering, flying, pulses_seen, still, sweeping
 from tests.stages.made import START_NS
 
 STEP_RAD = math.radians(0.2)  # between two pulses of a laser
@@ -150,13 +151,35 @@ def test_a_hole_smaller_than_allowed_is_bridged_and_counted():
 
 def test_a_step_in_range_separates_two_chords():
     rows, _, _ = feed(pulses([0] * 2 + [20.0] * 3 + [20.3] * 3 + [22.0] * 2 + [0] * 10))
-    assert rows[:, chord.COUNT].tolist() == [6]  # 0.3 m is within; what is farther behind is no end that hides
+    assert rows[:, chord.COUNT].tolist() == [6, 2]  # 0.3 m is within
+    assert rows[:, chord.FREE].tolist() == [2, 1]  # what is farther behind is no end that hides, and is hidden itself
     assert rows[0, chord.DEPTH] == pytest.approx(0.3, abs=1e-3)
     nearer, _, _ = feed(pulses([0] * 2 + [20.0] * 3 + [18.0] * 3 + [0] * 10))
     assert nearer[:, chord.COUNT].tolist() == [3, 3]
     assert nearer[:, chord.FREE].tolist() == [1, 2]  # the nearer one hides the end of the farther
     later, _, _ = feed(pulses([0] * 2 + [20.0] * 3 + [26.0] * 2 + [18.0] * 3 + [0] * 10))
     assert later[:, chord.FREE].tolist()[0] == 2  # two pulses had gone past its end before
+
+
+@pytest.mark.parametrize("after", [3, 30])
+def test_a_rain_drop_leaves_a_farther_object_as_it_is(after):
+    """A drop at 1 m and another at 2 m, then a drone, before the beam is a hole's width past the drops."""
+    drone = [20.0] * 5 + [0.0] * 90
+    alone, first_ns, last_ns = feed(pulses([0.0] * (2 + 2 * after) + drone))
+    rows, *times = feed(pulses([1.0] + [0.0] * after + [2.0] + [0.0] * after + drone))
+    of_drone = rows[:, chord.RANGE] > 3.0
+    assert sorted(rows[:, chord.RANGE].tolist()) == [1, 2, 20]
+    assert rows[of_drone, chord.FREE] == 2
+    np.testing.assert_array_equal(rows[of_drone], alone)
+    np.testing.assert_array_equal([t[of_drone] for t in times], [first_ns, last_ns])
+
+
+def test_a_nearer_object_that_continues_hides_the_end_of_one_behind_its_hole():
+    near, behind = [2.0] * 2, [20.0] * 2
+    rows, _, _ = feed(pulses([0.0] * 3 + near + behind + near + [0.0] * 90))
+    assert {(row[chord.RANGE], row[chord.COUNT], row[chord.FREE]) for row in rows} == {(2, 4, 2), (20, 2, 0)}
+    through, _, _ = feed(pulses([0.0] * 3 + near + [0.0] + behind + [0.0] * 2 + near + [0.0] * 90))
+    assert {(row[chord.RANGE], row[chord.COUNT], row[chord.FREE]) for row in through} == {(2, 4, 2), (20, 2, 2)}
 
 
 def test_lasers_are_independent():
@@ -190,7 +213,7 @@ def test_the_bulge_of_a_ball_is_half_over_its_radius_and_that_of_a_board_zero():
 
 
 def test_an_irregular_object_is_rough_and_three_returns_have_no_profile():
-    rugged, _, _ = feed(pulses([0, 20.0, 20.2, 19.9, 20.25, 20.0, *[0] * 10]))
+    rugged, _, _ = feed(pulses([0, 20.0, 20.2, 19.9, 20.2, 20.0, *[0] * 10]))
     assert rugged[0, chord.ROUGH] > 0.1
     few, _, _ = feed(pulses([0, 20.0, 20.1, 20.0, *[0] * 10]))
     assert math.isnan(few[0, chord.BULGE])
@@ -219,6 +242,24 @@ def test_a_ball_gives_short_free_chords_and_a_house_long_ones():
     of_house = rows[(rows[:, chord.X] < -2.9) & (rows[:, chord.Y] < -5.9)]
     assert of_house[:, chord.LONG].mean() > 0.7
     assert len(of_ball) + len(of_house) < len(rows)  # the others are the wire's
+
+
+def test_in_rain_most_scan_passes_over_a_drone_give_a_free_chord():
+    """Drops at 1 to 3 m in 1.5 % of the pulses, as in rain of 5 mm/h."""
+    rng = np.random.default_rng(7)
+    dry = list(pulses_seen([Ball(still(0.0, 14.0, 14.0), 0.25)], dithering(), 3.0))
+    free = {}
+    for rain in (False, True):
+        find, passes = finder(), set()
+        for part in dry:
+            drops = rng.uniform(1.0, 3.0, part.range_m.size).astype(np.float32)
+            fall = rain & (rng.random(part.range_m.size) < 0.015)
+            found = find.feed(replace(part, range_m=np.where(fall, drops, part.range_m)))
+            of_drone = (found.rows[:, chord.RANGE] > 10.0) & (found.rows[:, chord.FREE] == 2)
+            passes |= {int(t) // 100_000_000 for t in found.first_ns[of_drone] - START_NS}
+        free[rain] = len(passes)
+    assert free[False] > 20
+    assert free[True] > 0.75 * free[False]
 
 
 def test_an_empty_slice_has_no_chords():

@@ -25,7 +25,7 @@ from stages.geometry.frames import Array64
 from stages.geometry.se3 import CHI2_999_3, mahalanobis2
 from stages.geometry.trajectory import VehicleTrajectory
 from stages.heading.autopilot_samples import AutopilotSamples
-from stages.heading.earlier_run import EarlierRun
+from stages.heading.earlier_run import EarlierHeading, EarlierRun
 from stages.heading.heading_memory import HeadingMemory
 from stages.heading.imu_buffer import ImuBuffer
 from stages.heading.inertial_heading import InertialHeading, bias_free_turn, turn_between
@@ -209,9 +209,10 @@ class Estimator:
         R_map_vehicle, t = self._vehicle.at(stamp_ns)
         z, covariance = R_map_vehicle @ fix.xyz_vehicle_m + t, fix_covariance(fix, self._vehicle, self._errors)
         self.newest_fix_ns = max(stamp_ns, self.newest_fix_ns or stamp_ns)
+        self.earlier.add(stamp_ns, z, covariance.whole, self._velocity_map(fix))
         if self.odometry.odom_yaw is None:
-            self.odometry.start(self.earlier.odom_yaw(stamp_ns, z, covariance.whole))
-        earlier = self.earlier.heading(stamp_ns, z, covariance.whole, self.known and self.decided)
+            self.odometry.start(self.earlier.odom_yaw(stamp_ns))
+        earlier = self.earlier.heading(self.known and self.decided)
         if not self.known or earlier is not None:
             self._find(fix, z, covariance, earlier)
             return
@@ -289,19 +290,26 @@ class Estimator:
             self.suspect = True
             self.forget()
 
+    def _velocity_map(self, fix: DroneFix) -> Array64 | None:
+        """The tracker's velocity in `map`; None: not known."""
+        if fix.velocity_vehicle_mps is None:
+            return None
+        return self._vehicle.to_map(fix.stamp_ns, fix.xyz_vehicle_m, fix.velocity_vehicle_mps)[1]
+
     def _find(
-        self, fix: DroneFix, z: Array64, covariance: FixCovariance, earlier: tuple[float, float, float] | None = None
+        self, fix: DroneFix, z: Array64, covariance: FixCovariance, earlier: EarlierHeading | None = None
     ) -> None:
-        """Start at a LiDAR position; `earlier`: yaw of an earlier run, its sigma and the probability that it holds."""
-        velocity = fix.velocity_vehicle_mps
-        if velocity is not None:
-            velocity = self._vehicle.to_map(fix.stamp_ns, fix.xyz_vehicle_m, velocity)[1]
+        """Start at a LiDAR position; `earlier`: heading of an earlier run."""
         up = self._autopilot.up_drone(fix.stamp_ns)
         self._restart_filters()
         self.odometry.on_found()
-        memory = earlier or self._memory.yaw(fix.stamp_ns, z, covariance.whole)
+        if earlier is None:
+            memory = self._memory.yaw(fix.stamp_ns, z, covariance.whole)
+        else:
+            memory = earlier.yaw_rad, earlier.sigma_rad, earlier.probability
+            self.ownership.log_ratio += earlier.log_ratio
         level = np.array([0.0, 0.0, 1.0]) if up is None else up
-        self.heading.start(fix.stamp_ns, z, covariance.whole, velocity, level, memory)
+        self.heading.start(fix.stamp_ns, z, covariance.whole, self._velocity_map(fix), level, memory)
         self.fix_ns, self.bias_covariance_m2 = fix.stamp_ns, covariance.bias
 
     def _add_vertical(self, stamp_ns: int) -> None:

@@ -118,8 +118,9 @@ class Fuse(Stage[FuseSettings]):
 
     def on_prior(self, prior: HeadingPrior) -> Poses:
         """Heading that an earlier run of grd knew."""
-        numbers = np.array([prior.yaw_map_rad, prior.yaw_map_odom_rad, prior.sigma_rad, prior.position_sigma_m])
-        if self._intake.is_valid(prior, "heading prior", prior.xyz_map_m, numbers):
+        sigmas = prior.sigma_rad, prior.position_sigma_m, prior.velocity_sigma_mps
+        numbers = np.array([prior.yaw_map_rad, prior.yaw_map_odom_rad, *sigmas])
+        if self._intake.is_valid(prior, "heading prior", prior.xyz_map_m, prior.velocity_map_mps, numbers):
             self._estimator.earlier.prior = prior
         yield from self._publish(prior)
 

@@ -102,11 +102,11 @@ class EarlierOdomFrame(Message):
     xyz_map_m: Vec3  # origin of odom
 
 
-@message(schema=86)
+@message(schema=119)
 class HeadingPrior(Message):
-    """Yaw and position of the drone after a restart of grd in flight, by the autopilot's own propagation since.
+    """Yaw, position and velocity of the drone after a restart of grd in flight, by the autopilot's propagation since.
 
-    Valid if frame odom has not changed since the earlier run: then the LiDAR position is near this one.
+    Valid if frame odom has not changed since the earlier run: then LiDAR position and velocity are near these.
     """
 
     yaw_map_rad: float  # of the body
@@ -114,3 +114,5 @@ class HeadingPrior(Message):
     sigma_rad: float  # of both
     xyz_map_m: Vec3
     position_sigma_m: float  # one horizontal axis
+    velocity_map_mps: Vec3
+    velocity_sigma_mps: float  # one horizontal axis

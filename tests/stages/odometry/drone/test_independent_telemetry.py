@@ -145,7 +145,23 @@ def test_after_a_restart_the_frame_of_the_earlier_run_gives_yaw_and_position():
     c, s = math.cos(0.5), math.sin(0.5)
     np.testing.assert_allclose(made.xyz_map_m, [1 + 4 * c - 0.1 * s, 2 + 4 * s + 0.1 * c, 13.0])
     assert made.sigma_rad > EARLIER.sigma_rad
-    assert made.position_sigma_m == pytest.approx(math.hypot(0.5, 0.22), abs=0.01)  # 2 s
+    np.testing.assert_allclose(made.velocity_map_mps, [-s, c, 0.0])
+    assert made.position_sigma_m == pytest.approx(math.hypot(0.5, 0.12, 0.22), abs=0.01)  # 2 s at 1 m/s
+    assert made.velocity_sigma_mps == pytest.approx(math.hypot(0.06, 0.22), abs=0.01)
+
+
+def test_the_position_of_a_fast_drone_drifts_faster():
+    def sigma_m(speed_mps: float) -> float:
+        stage = IndependentTelemetry()
+        stage.on_earlier(EARLIER)
+        velocity = np.array([0.6 * speed_mps, 0.8 * speed_mps, 0.0])
+        stage.on_position(dataclasses.replace(own_position(400 * MS), velocity_odom_mps=velocity))
+        made = prior(stage, attitude(False))
+        assert made is not None
+        return made.position_sigma_m
+
+    assert sigma_m(0.0) == pytest.approx(math.hypot(0.5, 0.22), abs=0.01)
+    assert sigma_m(5.0) == pytest.approx(math.hypot(0.5, 0.6, 0.22), abs=0.01)
 
 
 def test_there_is_no_prior_without_an_earlier_run_or_a_recent_position():

@@ -209,8 +209,9 @@ def start(
     sigma, log_weight = np.full(STARTS, START_YAW_RAD), np.zeros(STARTS)
     if memory is not None:
         yaws, sigma = np.append(yaws, memory[0]), np.append(sigma, max(memory[1], math.radians(1.0)))
-        log_weight += math.log((1.0 - memory[2]) / STARTS)
-        log_weight = np.append(log_weight, math.log(memory[2]))
+        probability = min(max(memory[2], DROPPED), 1.0 - DROPPED)
+        log_weight += math.log((1.0 - probability) / STARTS)
+        log_weight = np.append(log_weight, math.log(probability))
     n = len(yaws)
     R_level = level(up_drone)
     R = np.array([rotation_z(yaw) @ R_level for yaw in yaws])

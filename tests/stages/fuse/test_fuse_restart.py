@@ -96,9 +96,11 @@ def test_a_prior_that_comes_after_the_first_positions_is_used_too():
     assert hover(from_s=2.0).decided_s < 10.0
 
 
-def test_a_prior_at_another_position_does_not_decide():
-    flown = hover(moved_m=6.0, turned_deg=90.0)
+@pytest.mark.parametrize("moved_m", [6.0, 200.0])
+def test_a_prior_at_another_position_does_not_decide(moved_m: float):
+    flown = hover(moved_m=moved_m, turned_deg=90.0)
     assert not any(flown.full)
+    assert flown.poses[-1].estimate is not None
 
 
 def test_a_more_uncertain_prior_weighs_less():

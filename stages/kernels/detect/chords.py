@@ -117,13 +117,13 @@ def _end_from(
 
     One that at least two pulses had gone past before had ended there.
     """
-    for d in range(depth, DEPTHS):
-        m = memory[laser, d]
-        if m[HITS] > 0.0:
-            _write_chord(m, m[MISSED] >= 2.0, laser, m[LONG_REPORTED] > 0.0, rows[count])
-            row_ns[count] = times[laser, d]
-            count += 1
-            m[HITS] = 0.0
+    while depth < DEPTHS and memory[laser, depth, HITS] > 0.0:
+        m = memory[laser, depth]
+        _write_chord(m, m[MISSED] >= 2.0, laser, m[LONG_REPORTED] > 0.0, rows[count])
+        row_ns[count] = times[laser, depth]
+        count += 1
+        m[HITS] = 0.0
+        depth += 1
     return count
 
 

@@ -45,6 +45,17 @@ def test_numbers_go_through_a_stage_to_the_sink_in_their_order(tmp_path):
     assert report.nodes["brittle"].calls == 101  # finish is one
 
 
+def test_a_stage_with_long_deadlines_takes_its_messages_without_being_woken_by_each(tmp_path):
+    config = DOUBLING.replace("number: line.number", "number: {from: line.number, deadline_ms: 1000}")
+    live = run_live(graph_of(tmp_path, config))
+    rest = [thread for thread in live._wiring.stage_threads if thread._rests]
+    assert [thread.name for thread in rest] == ["stage brittle"]
+    line_of(live).put(*range(100))
+    assert collector_of(live).take(100) == [2.0 * n for n in range(100)]
+    report = live.stop()
+    assert (report.dropped, report.events, report.edges["brittle.number"].taken) == (0, [], 100)
+
+
 def test_taps_get_every_message_and_recorders_every_record_in_and_out(tmp_path):
     memory = Memory()
     live = run_live(graph_of(tmp_path, DOUBLING), [memory])

@@ -429,6 +429,30 @@ def test_a_sweep_over_houses_reports_the_number_of_rejected_objects():
 # telemetry of the drone
 
 
+@pytest.mark.parametrize("settings", [{}, {"free_space": False}], ids=["all features", "without free space"])
+@pytest.mark.parametrize("driving", [False, True])
+def test_first_observations_are_rejected_together_as_one_by_one_with_candidates(driving, settings, monkeypatch):
+    drives_mps = (2.0, 0.0, 0.0) if driving else (0.0, 0.0, 0.0)
+    poles = [Wire((k - 6, 9, 0), (k - 6, 9, 6 + k % 3), 0.1) for k in range(12)]
+
+    def flown():
+        things = [*poles, Wire((-8, 6, 7), (8, 6, 7.5), 0.02), Drone(MOVING)]
+        return all_messages(things, 4.0, sweeping(), drives_mps, telemetry_of(MOVING), **settings)
+
+    together_ = flown()
+    monkeypatch.setattr(EvidenceDetect, "_reject_first", lambda _self, _now, _s, begin, *_: begin)
+    one_by_one = flown()
+    assert sum(len(m.candidate_id) for m in together_ if isinstance(m, CandidateLog)) > 200
+    assert [type(m) for m in together_] == [type(m) for m in one_by_one]
+    for a, b in zip(together_, one_by_one, strict=True):
+        if isinstance(a, CandidateLog):
+            np.testing.assert_array_equal(a.candidate_id, b.candidate_id)
+            np.testing.assert_array_equal(a.features, b.features)
+            np.testing.assert_array_equal(a.probability, b.probability)
+        elif isinstance(a, Detections):
+            assert a.summary == b.summary
+
+
 def test_the_yaw_of_the_odometrys_frame_does_not_matter():
     messages = [
         run([Drone(MOVING)], 2.0, publish=telemetry_of(MOVING, yaw_rad=yaw), accept_probability=0.5)

@@ -286,7 +286,7 @@ class InertialGraph:
         pose, bias = smoother.calculateEstimatePose3(X(n)), smoother.calculateEstimateConstantBias(B(n))
         velocity = smoother.calculateEstimateVector(V(n))
         joint = smoother.getISAM2().jointMarginalCovariance([X(n), V(n), B(n)]).fullMatrix()
-        R, xyz_m = pose.rotation().matrix(), pose.translation()
+        R, xyz_m = pose.rotation().matrix(), pose.translation().copy()  # GTSAM gives the position read-only
         if not (np.abs(xyz_m).max() < FARTHEST_M and is_covariance(joint)):  # NaN compares false
             return None
         to_map = _position_axes(R)

@@ -28,7 +28,7 @@ def compiled(function: F) -> F:
 
 
 def compiled_at_once(types: str) -> Callable[[F], F]:
-    """`compiled`, but compiled for these argument types at import; for other types at the first call.
+    """`compiled`, but compiled for these argument types at import. TypeError for others: to compile takes seconds.
 
     For functions that are first called in flight and not by `links/runs/warm_up.py`: "(float64[::1], float64)".
     """
@@ -36,6 +36,7 @@ def compiled_at_once(types: str) -> Callable[[F], F]:
     def compile_now(function: F) -> F:
         dispatcher = compiled(function)
         cast(Any, dispatcher).compile(types)
+        cast(Any, dispatcher).disable_compile()
         return dispatcher
 
     return compile_now

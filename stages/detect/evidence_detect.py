@@ -263,13 +263,13 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
             *now.false_returns.arrays, *settings.model.tables(compared=False), settings.span_m, self._follow_up_nats,
             ALL_FEATURES if settings.free_space else WITHOUT_FREE_SPACE, STATIC, log_odds, alternatives, features,
         )  # fmt: skip
-        for k, nats, alternative in zip(
-            range(begin, left), log_odds[begin:left].tolist(), alternatives[begin:left].tolist(), strict=True
-        ):
+        nats: list[float] = log_odds.tolist()
+        kinds: list[int] = alternatives.tolist()
+        for k in range(begin, left):
             now.number += 1
             xyz_m, seen_ns = s.rows[k, X : Z + 1], int(s.stamps_ns[k])
-            now.classified[now.number] = Classified(now.number, seen_ns, xyz_m, nats, features[k])
-            now.rejected[ALTERNATIVES[alternative].value] += 1
+            now.classified[now.number] = Classified(now.number, seen_ns, xyz_m, nats[k], features[k])
+            now.rejected[ALTERNATIVES[kinds[k]].value] += 1
         return left
 
     def _associate(self, now: _State, s: Observation) -> bool:

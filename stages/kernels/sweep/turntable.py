@@ -48,7 +48,7 @@ def angle_at(
     if n == 0 or t_ns < state_ns[0] or t_ns > state_ns[n - 1]:
         return math.nan, after
     if not (0 < after < n and state_ns[after - 1] < t_ns <= state_ns[after]):
-        after = np.searchsorted(state_ns, t_ns)
+        after = int(np.searchsorted(state_ns, t_ns))
     if state_ns[after] == t_ns:
         return state_rad[after], after
     gap_ns = state_ns[after] - state_ns[after - 1]

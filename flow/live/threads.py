@@ -107,7 +107,7 @@ class StageRun:
 
     @property
     def deadline_ms(self) -> float:
-        """The shortest of its inputs."""
+        """Shortest deadline of its inputs."""
         return min((count.edge.queue.deadline_ms for _, count in self._ports), default=math.inf)
 
     def takes_newest(self, port: int) -> bool:

@@ -11,12 +11,11 @@ import math
 from collections.abc import Iterable, Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stages.detect.candidate import Candidate, Observation
 from stages.detect.observations import Slice
 from stages.geometry.frames import Array64
-from stages.kernels.detect.candidate_table import NO_PULSE, OUTSIDE, count_pulses, nearest_rows
+from stages.kernels.detect.candidate_table import NO_PULSE, OUTSIDE, TableArrays, count_pulses, nearest_rows
 
 ROWS = 64  # initial size; the table grows
 STATE = 9  # columns: position, velocity, variances
@@ -78,9 +77,9 @@ class CandidateTable:
         return reacquired, other
 
     @property
-    def arrays(self) -> tuple[int, Array64, NDArray[np.int64], NDArray[np.bool_], int]:
-        """Time of the last promising observation, states, times, whether reacquired, and rows, as of `reject_first`."""
-        return self._promising_ns, self._state, self._ns, self._reacquired, len(self._candidates)
+    def arrays(self) -> TableArrays:
+        """The candidates, as compiled functions take them."""
+        return TableArrays(self._state, self._ns, self._reacquired, len(self._candidates), self._promising_ns)
 
     def has_promising_since(self, stamp_ns: int) -> bool:
         """Whether a promising candidate may have been observed at this time or later."""

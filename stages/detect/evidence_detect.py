@@ -17,13 +17,12 @@ Source: ours, for P III.B; DESIGN, The graph: detect.
 from __future__ import annotations
 
 import math
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flow.stage import Settings, Stage
@@ -38,12 +37,12 @@ from stages.detect.candidate_messages import (
 )
 from stages.detect.candidate_table import CandidateTable, positions_of
 from stages.detect.flight import scatter_m
-from stages.detect.isolation import LargeObjectMap
 from stages.detect.observations import ObservationFinder, ObservationLimits, Observations, Slice
 from stages.detect.reacquire import reacquired_candidate, without_duplicates
+from stages.detect.rejected import Criteria, RejectedObservations
 from stages.detect.telemetry import DetectorTelemetry
-from stages.detect.trained.existence import FalseReturns, passed_nats
-from stages.detect.trained.features import FEATURES, FREE_SPACE, features_of
+from stages.detect.trained.existence import passed_nats
+from stages.detect.trained.features import FREE_SPACE, features_of
 from stages.detect.trained.model import ALTERNATIVES, LEAST_NATS, DetectorModel, Prediction, reasons_of
 from stages.geometry.frames import Array64
 from stages.geometry.rig_lidar import RigLidar
@@ -51,14 +50,7 @@ from stages.geometry.trajectory import VehicleTrajectory
 from stages.kernels.detect.candidate import SIGMA_M
 from stages.kernels.detect.candidate_table import first_within
 from stages.kernels.detect.existence import birth_nats
-from stages.kernels.detect.first_observations import (
-    NEAR_REJECTED_M,
-    NEAR_REJECTED_NS,
-    NEAR_REJECTED_UNKNOWN_NS,
-    REVISITED_M,
-    STATIC_M,
-    reject_first,
-)
+from stages.kernels.detect.first_observations import STATIC_M
 from stages.kernels.detect.observations import X, Z
 from stages.kernels.sweep.pulses import cone_of
 from stages.messages import (
@@ -82,8 +74,6 @@ MAX_STATIC = 64  # static objects remembered
 # only where they would be accepted in its place.
 HYSTERESIS_NATS = 1.65
 AT_REST_MPS = np.zeros(3)
-STATIC = ALTERNATIVES.index(Alternative.STATIC)
-ALL_FEATURES, WITHOUT_FREE_SPACE = np.empty(0, dtype=np.int64), np.array(FREE_SPACE)
 COMPARED_NS = 500_000_000  # a cue is compared with a candidate observed this recently,
 COMPARED_PASSES = 5  # in so many scan passes
 CUE_MARGIN_NATS = 0.5  # below the threshold of acceptance
@@ -112,11 +102,9 @@ class _State:
     table: CandidateTable = field(default_factory=CandidateTable)
     static: deque[Candidate] = field(default_factory=lambda: deque[Candidate](maxlen=MAX_STATIC))
     static_m: Array64 = field(default_factory=lambda: np.empty((0, 3)))  # their positions
-    rejected_map: LargeObjectMap = field(default_factory=LargeObjectMap)
-    false_returns: FalseReturns = field(default_factory=FalseReturns)
+    rejected: RejectedObservations = field(default_factory=RejectedObservations)
     classified: dict[int, Classified] = field(default_factory=dict[int, Classified])  # in this slice
     watches: dict[int, _Watch] = field(default_factory=lambda: dict[int, _Watch]())
-    rejected: Counter[str] = field(default_factory=Counter[str])
     pruned_ns: int = 0
     odometry_jumped: bool = False  # the map frame changed: all positions are invalid
     number: int = 0  # of the newest candidate
@@ -182,6 +170,7 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
         self._now = _State(finder, travel, CueEvidence(settings.cues, settings.furthest_m))
         self._accept_nats = log_odds_of(settings.accept_probability)
         self._follow_up_nats = log_odds_of(settings.follow_up_probability)
+        self._criteria = Criteria(settings.model, self._follow_up_nats, settings.span_m, settings.free_space)
 
     def on_motion(self, motion: VehicleMotion) -> None:
         """Update the vehicle's trajectory. Without it only vertical motion counts, unless `parked` is set."""
@@ -238,39 +227,27 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
         """Whether the vehicle's motion is known, so that static objects are static in the map frame."""
         return self.settings.parked or self._now.trail.known_at(stamp_ns)
 
-    def _associate_all(self, now: _State, observations: Observations) -> bool:
-        """Reject most observations in compiled calls, and associate the others. True: publish a change."""
-        stamps_ns = observations.stamps_ns.tolist()
+    def _associate_all(self, now: _State, s: Observations) -> bool:
+        """Reject most observations together, and associate the others one by one. True: publish a change."""
+        stamps_ns = s.stamps_ns.tolist()
         known, moves = (
             np.array([flag(stamp_ns) for stamp_ns in stamps_ns]) for flag in (self._motion_known, now.telemetry.moves)
         )
         changed, begin = False, 0
         while begin < len(stamps_ns):
-            left = begin if now.cues.known else self._reject_first(now, observations, begin, known, moves)
+            left = begin
+            if not now.cues.known:
+                left, log_odds, features = now.rejected.add_first(
+                    s, begin, known, moves, now.table, now.static_m, self._criteria
+                )
+                for k in range(begin, left):
+                    now.number += 1
+                    xyz_m = s.rows[k, X : Z + 1]
+                    now.classified[now.number] = Classified(now.number, stamps_ns[k], xyz_m, log_odds[k], features[k])
             if left < len(stamps_ns):
-                changed |= self._associate(now, observations.one(left))
+                changed |= self._associate(now, s.one(left))
             begin = left + 1
         return changed
-
-    def _reject_first(
-        self, now: _State, s: Observations, begin: int, known: NDArray[np.bool_], moves: NDArray[np.bool_]
-    ) -> int:
-        """Reject observations that are not promising and fit no candidate; the index of the first one that is left."""
-        n, settings = len(s.stamps_ns), self.settings
-        log_odds, alternatives, features = np.empty(n), np.empty(n, dtype=np.int64), np.empty((n, len(FEATURES)))
-        left = reject_first(
-            begin, s.stamps_ns, s.rows, known, moves, *now.table.arrays, now.static_m, *now.rejected_map.arrays,
-            *now.false_returns.arrays, *settings.model.tables(compared=False), settings.span_m, self._follow_up_nats,
-            ALL_FEATURES if settings.free_space else WITHOUT_FREE_SPACE, STATIC, log_odds, alternatives, features,
-        )  # fmt: skip
-        nats: list[float] = log_odds.tolist()
-        kinds: list[int] = alternatives.tolist()
-        for k in range(begin, left):
-            now.number += 1
-            xyz_m, seen_ns = s.rows[k, X : Z + 1], int(s.stamps_ns[k])
-            now.classified[now.number] = Classified(now.number, seen_ns, xyz_m, nats[k], features[k])
-            now.rejected[ALTERNATIVES[kinds[k]].value] += 1
-        return left
 
     def _associate(self, now: _State, s: Observation) -> bool:
         """Assign an observation to the candidate that it fits, or start a new one. True: publish a change."""
@@ -280,14 +257,12 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
         best = other or self._reactivate(now, s)
         if best is not None:
             return self._update(now, best, s) or reacquired is not None
-        memory_ns = NEAR_REJECTED_NS if self._motion_known(s.stamp_ns) else NEAR_REJECTED_UNKNOWN_NS
-        rejected_m = now.rejected_map.nearest_m(s.xyz_map_m, 0.0, NEAR_REJECTED_M, s.stamp_ns - memory_ns)
-        near_rejected = math.isfinite(rejected_m)
+        near_rejected, revisited = now.rejected.near(s, self._motion_known(s.stamp_ns), now.telemetry.moves(s.stamp_ns))
         # under trees observations are frequent at any position, so that a reacquisition would be by chance
         if reacquired is None and not near_rejected and not math.isfinite(s.large_object_m):
             self._reacquire(now, s)
         now.number += 1
-        false_per_s = now.false_returns.per_s(s.range_m, s.stamp_ns)
+        false_per_s = now.rejected.false_returns.per_s(s.range_m, s.stamp_ns)
         new = Candidate(
             number=now.number,
             stamp_ns=s.stamp_ns,
@@ -301,7 +276,7 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
             false_per_s=false_per_s,
             existence_nats=birth_nats(false_per_s),
             near_rejected=near_rejected,
-            revisited=rejected_m < REVISITED_M and now.telemetry.moves(s.stamp_ns),
+            revisited=revisited,
         )
         new.add_observation(s)
         changed = self._classify(now, new)
@@ -309,15 +284,8 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
             new.velocity_mps = now.trail.velocity_mps(s.stamp_ns)  # a drone follows the vehicle
             now.table.put(new)
         else:
-            self._reject(now, s, new.alternative)
+            now.rejected.add(s, new.alternative)
         return changed
-
-    def _reject(self, now: _State, s: Observation, alternative: Alternative) -> None:
-        """Count a rejected first observation, and remember its position if it is of a static object."""
-        now.rejected[alternative.value] += 1
-        now.false_returns.add(s.range_m, s.stamp_ns)
-        if alternative is Alternative.STATIC:
-            now.rejected_map.add(s.xyz_map_m[None], s.stamp_ns)
 
     def _predict(self, features: Array64) -> Prediction:
         if not self.settings.free_space:
@@ -326,7 +294,7 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
 
     def _update(self, now: _State, c: Candidate, s: Observation) -> bool:
         """Update a candidate with an observation. True: publish a change."""
-        c.false_per_s = now.false_returns.per_s(s.range_m, s.stamp_ns)
+        c.false_per_s = now.rejected.false_returns.per_s(s.range_m, s.stamp_ns)
         c.update(s)
         changed = self._classify(now, c)
         now.table.put(c)
@@ -445,7 +413,7 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
         for c in now.table:
             if now_ns - c.seen_ns >= self._retention_ns(c):
                 if c.scan_passes == 1:
-                    now.false_returns.add(c.range_m, now_ns)
+                    now.rejected.false_returns.add(c.range_m, now_ns)
                 if not c.is_promising:
                     self._remember_rejected(now, c)
         if self._motion_known(now_ns):
@@ -461,7 +429,8 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
     def _reset(self, now: _State) -> bool:
         """Remove everything: after a jump of the vehicle's odometry no position in the map frame is valid."""
         gone = any(c.is_promising for c in now.table)
-        now.odometry_jumped, now.static_m, now.rejected_map = False, positions_of(()), LargeObjectMap()
+        now.odometry_jumped, now.static_m = False, positions_of(())
+        now.rejected.forget_positions()
         now.table.keep(())
         now.static.clear()
         now.watches.clear()
@@ -471,7 +440,7 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
     def _remember_rejected(self, now: _State, c: Candidate) -> None:
         """Remember the position of a rejected static object."""
         if c.alternative is Alternative.STATIC and (c.scan_passes < 3 or c.is_static):
-            now.rejected_map.add(c.xyz_m[None], c.seen_ns)
+            now.rejected.static_map.add(c.xyz_m[None], c.seen_ns)
 
     def _retention_ns(self, c: Candidate) -> float:
         """How long a candidate is kept without an observation."""
@@ -506,12 +475,12 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
             end_ns = now_ns
         else:
             return
-        rejected = now.rejected + now.finder.hidden
+        rejected = now.rejected.kinds + now.finder.hidden
         yield detections_message(now.table, now.trail, now.start_ns, end_ns, rejected, settings.max_candidates)
         for c in new:
             c.announced = True
         now.start_ns, now.end_ns = end_ns + 1, None
-        now.rejected.clear()
+        now.rejected.kinds.clear()
         now.finder.hidden.clear()
 
 

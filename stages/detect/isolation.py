@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.geometry.frames import Array64
-from stages.kernels.detect.isolation import MAP_SIZE, mark_cells, nearest_marked
+from stages.kernels.detect.isolation import MAP_SIZE, MarkedCells, mark_cells, nearest_marked
 from stages.kernels.detect.pulse_buffer import keep_slice
 from stages.messages import SweptPulses
 
@@ -67,9 +67,9 @@ class LargeObjectMap:
         self._when = np.zeros(MAP_SIZE, dtype=np.int64)
 
     @property
-    def arrays(self) -> tuple[float, NDArray[np.int64], NDArray[np.int64]]:
-        """Size of a cell, keys and times of the cells, as `nearest_marked` takes them."""
-        return self._cell_m, self._key, self._when
+    def arrays(self) -> MarkedCells:
+        """The cells, as compiled functions take them."""
+        return MarkedCells(self._cell_m, self._key, self._when)
 
     def add(self, points_m: Array64, stamp_ns: int) -> None:
         """Add points (n, 3) of large objects, in a static frame."""

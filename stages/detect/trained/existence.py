@@ -21,7 +21,7 @@ import math
 
 import numpy as np
 
-from stages.kernels.detect.existence import SHELL_M, SHELLS, add_false_return, false_returns_per_s
+from stages.kernels.detect.existence import SHELL_M, SHELLS, FalseReturnHistogram, add_false_return, false_returns_per_s
 
 PASS_S = 0.1  # between scan passes: 600 rpm
 CERTAIN_NATS = 30.0  # limit of arithmetic
@@ -34,16 +34,15 @@ class FalseReturns:
     """Rate of observations that belong to no candidate, by range: false returns, rain drops, leaves, static objects."""
 
     def __init__(self) -> None:
-        self.arrays = np.zeros(SHELLS), np.zeros(1, dtype=np.int64)
-        """Faded number by range, and the time of the newest, as `add_false_return` takes them."""
+        self.arrays = FalseReturnHistogram(np.zeros(SHELLS), np.zeros(1, dtype=np.int64))
 
     def add(self, range_m: float, stamp_ns: int) -> None:
         """Count one."""
-        add_false_return(*self.arrays, range_m, stamp_ns)
+        add_false_return(self.arrays, range_m, stamp_ns)
 
     def per_s(self, range_m: float, stamp_ns: int) -> float:
         """Rate [1/s] in the shell at this range, at least LEAST_FALSE_PER_S."""
-        return false_returns_per_s(*self.arrays, range_m, stamp_ns)
+        return false_returns_per_s(self.arrays, range_m, stamp_ns)
 
 
 def survived_nats(nats: float, dt_s: float) -> float:

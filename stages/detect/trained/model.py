@@ -28,7 +28,7 @@ from stages.detect.candidate import Alternative
 from stages.detect.trained.features import FEATURES, NAMES, TELEMETRY, VERSION
 from stages.geometry.frames import Array64
 from stages.geometry.lidar_models import LidarModel
-from stages.kernels.detect.model import evaluate
+from stages.kernels.detect.model import ModelTables, evaluate
 
 ALTERNATIVES = tuple(Alternative)
 REASONS = 3  # contributions named for people
@@ -81,9 +81,9 @@ class DetectorModel(StrictModel):
             raise ValueError(f"priors: there are {len(ALTERNATIVES)} alternatives")
         return self
 
-    def tables(self, compared: bool) -> tuple[NDArray[np.int64], Array64, Array64, Array64, Array64]:
-        """The first arguments of `evaluate`, for a candidate that is compared with telemetry or not."""
-        return *self._terms, self._priors[int(compared)]
+    def tables(self, compared: bool) -> ModelTables:
+        """The model of a candidate that is compared with telemetry or not, as compiled functions take it."""
+        return ModelTables(*self._terms, self._priors[int(compared)])
 
     @cached_property
     def _terms(self) -> tuple[NDArray[np.int64], Array64, Array64, Array64]:
@@ -103,7 +103,7 @@ class DetectorModel(StrictModel):
 
     def predict(self, features: Array64) -> Prediction:
         """Log-odds of a drone for features (len(FEATURES),)."""
-        return Prediction(*evaluate(*self.tables(not math.isnan(features[TELEMETRY])), features))
+        return Prediction(*evaluate(self.tables(not math.isnan(features[TELEMETRY])), features))
 
 
 def reasons_of(features: Array64, prediction: Prediction) -> str:

@@ -6,6 +6,7 @@ Source: see `stages/detect/candidate_table.py`.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,16 @@ CHUNK = 192  # pulses of a slice for which a candidate is taken as static: 0.6 m
 X, Y, Z, VX, VY, VZ, P_X, P_XV, P_V = range(9)  # [m], [m/s] in frame map, and their variances
 STAMP, SEEN = 0, 1  # [ns]
 NO_PULSE, NEAR, OUTSIDE = 0, 1, 2  # status of a candidate: no pulse near its middle; pulses near it; outside the fan
+
+
+class TableArrays(NamedTuple):
+    """The detector's candidates."""
+
+    state: Array64  # (most, columns)
+    ns: NDArray[np.int64]  # (most, 2)
+    reacquired: NDArray[np.bool_]  # (most,)
+    rows: int  # only the first rows are used
+    promising_ns: int  # no promising candidate was observed later
 
 
 @compiled

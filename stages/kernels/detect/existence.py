@@ -6,6 +6,7 @@ Source: see `stages/detect/trained/existence.py`.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,25 +21,33 @@ BIRTHS_PER_S = 0.02  # assumed: one object appears in the sky in 50 s
 LEAST_FALSE_PER_S = 0.05  # false returns of a clear sky, per shell: the prior of the histogram
 
 
+class FalseReturnHistogram(NamedTuple):
+    """False returns by range, faded to the time of the newest."""
+
+    counts: Array64  # (SHELLS,)
+    newest_ns: NDArray[np.int64]  # (1,)
+
+
 @compiled
 def _shell(range_m: float) -> int:
     return min(int(range_m / SHELL_M), SHELLS - 1)
 
 
 @compiled
-def add_false_return(count: Array64, newest_ns: NDArray[np.int64], range_m: float, stamp_ns: int) -> None:
-    """Count one in the faded histogram count (SHELLS,), as of newest_ns (1,)."""
+def add_false_return(histogram: FalseReturnHistogram, range_m: float, stamp_ns: int) -> None:
+    """Count one."""
+    counts, newest_ns = histogram.counts, histogram.newest_ns
     if stamp_ns > newest_ns[0]:
-        count *= math.exp(-(stamp_ns - newest_ns[0]) * 1e-9 / MEMORY_S)
+        counts *= math.exp(-(stamp_ns - newest_ns[0]) * 1e-9 / MEMORY_S)
         newest_ns[0] = stamp_ns
-    count[_shell(range_m)] += 1.0
+    counts[_shell(range_m)] += 1.0
 
 
 @compiled
-def false_returns_per_s(count: Array64, newest_ns: NDArray[np.int64], range_m: float, stamp_ns: int) -> float:
-    """Rate [1/s] in the shell at this range, at least LEAST_FALSE_PER_S; see `add_false_return`."""
-    fading = math.exp(-max(stamp_ns - newest_ns[0], 0) * 1e-9 / MEMORY_S)
-    return LEAST_FALSE_PER_S + count[_shell(range_m)] * fading / MEMORY_S
+def false_returns_per_s(histogram: FalseReturnHistogram, range_m: float, stamp_ns: int) -> float:
+    """Rate [1/s] in the shell at this range, at least LEAST_FALSE_PER_S."""
+    fading = math.exp(-max(stamp_ns - histogram.newest_ns[0], 0) * 1e-9 / MEMORY_S)
+    return LEAST_FALSE_PER_S + histogram.counts[_shell(range_m)] * fading / MEMORY_S
 
 
 @compiled

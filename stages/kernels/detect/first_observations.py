@@ -1,11 +1,12 @@
 """Compiled rejection of first observations. Most observations are of edges, leaves and wires: they begin no candidate.
 
-Source: see `stages/detect/evidence_detect.py`.
+Source: see `stages/detect/rejected.py`.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +14,10 @@ from numpy.typing import NDArray
 from stages.geometry.frames import Array64
 from stages.kernels.compiled import compiled
 from stages.kernels.detect.candidate import neighbour_score, return_count_nats
-from stages.kernels.detect.candidate_table import first_within, nearest_rows
-from stages.kernels.detect.existence import add_false_return, birth_nats, false_returns_per_s
-from stages.kernels.detect.isolation import SECTORS, mark_cells, nearest_marked
-from stages.kernels.detect.model import evaluate
+from stages.kernels.detect.candidate_table import TableArrays, first_within, nearest_rows
+from stages.kernels.detect.existence import FalseReturnHistogram, add_false_return, birth_nats, false_returns_per_s
+from stages.kernels.detect.isolation import SECTORS, MarkedCells, mark_cells, nearest_marked
+from stages.kernels.detect.model import ModelTables, evaluate
 from stages.kernels.detect.observations import LARGE_OBJECT, RANGE, RETURNS, ROUGH, ROUND, TALLY_0, TOO_LONG, X, Z
 
 PULSE_RAD = math.radians(0.2)  # between two pulses of a laser: VLP-16, 600 rpm
@@ -71,6 +72,24 @@ def first_features(
         features[k] = value
 
 
+class Judged(NamedTuple):
+    """Results of the model for k observations."""
+
+    log_odds: Array64  # (k,)
+    alternative: NDArray[np.int64]  # (k,)
+    features: Array64  # (k, n)
+
+
+@compiled
+def near_rejected(
+    xyz_m: Array64, stamp_ns: int, motion_known: bool, drone_moves: bool, rejected: MarkedCells
+) -> tuple[bool, bool]:
+    """Whether a static object was rejected near a position (3,), and at it while the drone reports that it moves."""
+    since_ns = stamp_ns - (NEAR_REJECTED_NS if motion_known else NEAR_REJECTED_UNKNOWN_NS)
+    away_m = nearest_marked(xyz_m, rejected.cell_m, 0.0, NEAR_REJECTED_M, since_ns, rejected.key, rejected.when)
+    return math.isfinite(away_m), away_m < REVISITED_M and drone_moves
+
+
 @compiled
 def reject_first(
     begin: int,
@@ -78,64 +97,46 @@ def reject_first(
     rows: Array64,
     motion_known: NDArray[np.bool_],
     drone_moves: NDArray[np.bool_],
-    promising_ns: int,
-    state: Array64,
-    ns: NDArray[np.int64],
-    reacquired: NDArray[np.bool_],
-    candidates: int,
+    table: TableArrays,
     static_m: Array64,
-    cell_m: float,
-    key: NDArray[np.int64],
-    when: NDArray[np.int64],
-    count: Array64,
-    newest_ns: NDArray[np.int64],
-    where: NDArray[np.int64],
-    knots: Array64,
-    values: Array64,
-    missing: Array64,
-    priors: Array64,
+    rejected: MarkedCells,
+    false_returns: FalseReturnHistogram,
+    model: ModelTables,
     span_m: float,
     follow_up_nats: float,
     left_out: NDArray[np.int64],
     static: int,
-    log_odds: Array64,
-    alternatives: NDArray[np.int64],
-    features: Array64,
+    judged: Judged,
 ) -> int:
     """Reject observations from `begin` on, as long as each fits no candidate and is not promising by itself.
 
     Returns the index of the first that is left, of stamps_ns (k,) and rows (k, COLUMNS) of `observe`. It may continue a
-    candidate or begin one, or other candidates count. Of those rejected it fills log_odds (k,), alternatives (k,) and
-    features (k, n), counts them as false returns and marks the static ones in the map of rejected objects.
+    candidate or begin one, or other candidates count. Those rejected are `judged`, counted in `false_returns`, and
+    marked in the map `rejected` if they are static.
 
-    Whether the vehicle's motion is known and the drone reports that it moves: (k,) each. The candidates are those of
-    `nearest_rows`, static_m (m, 3) remembered static objects; map and false returns as in `nearest_marked` and
-    `add_false_return`, the model as in `evaluate`; left_out: features that an ablation does not use; static: index of
-    that alternative.
+    motion_known, drone_moves (k,): whether the vehicle's motion is known, and the drone reports that it moves. static_m
+    (m, 3): remembered static objects. left_out: features that an ablation does not use. static: index of that
+    alternative.
     """
     for i in range(begin, stamps_ns.size):
-        row, stamp_ns = rows[i], stamps_ns[i]
+        row, stamp_ns, features = rows[i], stamps_ns[i], judged.features[i]
         xyz_m = row[X : Z + 1]
-        if promising_ns >= stamp_ns or first_within(static_m, xyz_m, STATIC_M) >= 0:
+        if table.promising_ns >= stamp_ns or first_within(static_m, xyz_m, STATIC_M) >= 0:
             return i
-        fit, other = nearest_rows(state, ns, reacquired, candidates, stamp_ns, xyz_m)
+        fit, other = nearest_rows(table.state, table.ns, table.reacquired, table.rows, stamp_ns, xyz_m)
         if fit >= 0 or other >= 0:
             return i
-        since_ns = stamp_ns - (NEAR_REJECTED_NS if motion_known[i] else NEAR_REJECTED_UNKNOWN_NS)
-        rejected_m = nearest_marked(xyz_m, cell_m, 0.0, NEAR_REJECTED_M, since_ns, key, when)
-        near_rejected = math.isfinite(rejected_m)
-        alone = not near_rejected and not math.isfinite(row[LARGE_OBJECT])
-        if alone and candidates > 0 and motion_known[i] and drone_moves[i]:
+        near, revisited = near_rejected(xyz_m, stamp_ns, motion_known[i], drone_moves[i], rejected)
+        alone = not near and not math.isfinite(row[LARGE_OBJECT])
+        if alone and table.rows > 0 and motion_known[i] and drone_moves[i]:  # it may be a candidate seen elsewhere
             return i
-        revisited = rejected_m < REVISITED_M and drone_moves[i]
-        false_per_s = false_returns_per_s(count, newest_ns, row[RANGE], stamp_ns)
-        first_features(row, span_m, false_per_s, near_rejected, revisited, features[i])
+        first_features(row, span_m, false_returns_per_s(false_returns, row[RANGE], stamp_ns), near, revisited, features)
         for k in left_out:
-            features[i, k] = math.nan
-        log_odds[i], alternatives[i], _ = evaluate(where, knots, values, missing, priors, features[i])
-        if log_odds[i] >= follow_up_nats:
+            features[k] = math.nan
+        judged.log_odds[i], judged.alternative[i], _ = evaluate(model, features)
+        if judged.log_odds[i] >= follow_up_nats:
             return i
-        add_false_return(count, newest_ns, row[RANGE], stamp_ns)
-        if alternatives[i] == static:
-            mark_cells(rows[i : i + 1, X : Z + 1], cell_m, stamp_ns, key, when)
+        add_false_return(false_returns, row[RANGE], stamp_ns)
+        if judged.alternative[i] == static:
+            mark_cells(rows[i : i + 1, X : Z + 1], rejected.cell_m, stamp_ns, rejected.key, rejected.when)
     return stamps_ns.size

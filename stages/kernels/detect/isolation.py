@@ -6,6 +6,7 @@ Source: see `stages/detect/isolation.py`.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,14 @@ FARTHER_0 = OCCUPIED_0 + SECTORS  # 8 with a return, but not close
 TALLY = FARTHER_0 + SECTORS
 BITS = 16  # log2 of the map's table size
 MAP_SIZE = 1 << BITS
+
+
+class MarkedCells(NamedTuple):
+    """A map of cells that were marked, as a hash table."""
+
+    cell_m: float
+    key: NDArray[np.int64]
+    when: NDArray[np.int64]  # [ns]
 
 
 @compiled
@@ -79,7 +88,7 @@ def count_sectors(
 
 @compiled
 def _sector(a: float, b: float) -> int:
-    """Number of the sector of 45 deg with a direction a, b, from that of -a to -b and on."""
+    """Index of the sector, one of SECTORS of 45 deg, that holds the direction (a, b); counter-clockwise from -a."""
     if b < 0.0:
         if a < 0.0:
             return 0 if b > a else 1

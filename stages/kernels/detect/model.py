@@ -6,6 +6,7 @@ Source: see `stages/detect/trained/model.py`.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,20 +15,26 @@ from stages.geometry.frames import Array64
 from stages.kernels.compiled import compiled
 
 
+class ModelTables(NamedTuple):
+    """See `DetectorModel`."""
+
+    where: NDArray[np.int64]
+    knots: Array64
+    values: Array64
+    missing: Array64
+    priors: Array64  # (alternatives,)
+
+
 @compiled
 def evaluate(
-    where: NDArray[np.int64],
-    knots: Array64,
-    values: Array64,
-    missing: Array64,
-    priors: Array64,
+    model: ModelTables,
     x: Array64,
 ) -> tuple[float, int, Array64]:
     """(log-odds of a drone, most probable alternative, contributions (n,)) for features x (n,).
 
-    See `DetectorModel` for where, knots, values, missing; priors (alternatives,). The contribution of a feature is that
-    of its terms, each weighted by the probability of its alternative among them.
+    The contribution of a feature is that of its terms, each weighted by the probability of its alternative among them.
     """
+    where, knots, values, missing, priors = model
     over, contributions = priors.copy(), np.zeros((priors.size, x.size))
     for row in range(where.shape[0]):
         alternative, feature, last = where[row, 0], where[row, 1], where[row, 2] - 1

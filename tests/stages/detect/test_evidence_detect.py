@@ -22,6 +22,7 @@ from stages.detect import EvidenceDetect
 from stages.detect.candidate import Alternative, Observation
 from stages.detect.candidate_messages import detections_message, log_odds_of
 from stages.detect.evidence_detect import HYSTERESIS_NATS, STATIC_NS
+from stages.detect.rejected import RejectedObservations
 from stages.detect.trained.features import NAMES, VERSION
 from stages.detect.trained.model import DetectorModel, Prediction
 from stages.geometry.frames import rotation_from_rpy_deg, rotation_z
@@ -440,7 +441,7 @@ def test_first_observations_are_rejected_together_as_one_by_one_with_candidates(
         return all_messages(things, 4.0, sweeping(), drives_mps, telemetry_of(MOVING), **settings)
 
     together_ = flown()
-    monkeypatch.setattr(EvidenceDetect, "_reject_first", lambda _self, _now, _s, begin, *_: begin)
+    monkeypatch.setattr(RejectedObservations, "add_first", lambda _self, _s, begin, *_: (begin, [], None))
     one_by_one = flown()
     assert sum(len(m.candidate_id) for m in together_ if isinstance(m, CandidateLog)) > 200
     assert [type(m) for m in together_] == [type(m) for m in one_by_one]
@@ -724,8 +725,8 @@ def test_only_static_objects_leave_a_rejected_position(alternative):
     stage = detector(parked=True, model={"feature_version": VERSION, "priors": priors, "terms": [TERM]})
     stage._associate(stage._now, observation(1.0, (0.0, 45.0, 45.0)))
     assert list(stage._now.table) == []
-    assert dict(stage._now.rejected) == {alternative.value: 1}
-    nearest_m = stage._now.rejected_map.nearest_m(np.array([0.0, 45.0, 45.0]), 0.0, NEAR_REJECTED_M, START_NS)
+    assert dict(stage._now.rejected.kinds) == {alternative.value: 1}
+    nearest_m = stage._now.rejected.static_map.nearest_m(np.array([0.0, 45.0, 45.0]), 0.0, NEAR_REJECTED_M, START_NS)
     assert math.isfinite(nearest_m) == (alternative is Alternative.STATIC)
 
 
@@ -923,7 +924,7 @@ def test_a_rejected_lamp_is_not_published_again():
     def found(trajectory, left_out=()):
         terms = tuple(term for term in shipped_model().terms if term.feature not in left_out)
         stage = detector(sweep_deg=PASS_DEG, model=dict(shipped_model()) | {"terms": terms})
-        stage._now.rejected_map.add(np.array([PLACE_M]), START_NS)
+        stage._now.rejected.static_map.add(np.array([PLACE_M]), START_NS)
         messages = all_messages([hovering()], 1.0, publish=telemetry_of(trajectory), stage=stage)
         published = any(m.candidate_id.size for m in messages if isinstance(m, Candidates))
         probability = next(m.probability[0] for m in messages if isinstance(m, CandidateLog))
@@ -945,5 +946,5 @@ def test_only_static_candidates_are_remembered_as_rejected_objects(step_m, remem
     c.alternative = Alternative.STATIC
     stage = detector(parked=True)
     stage._remember_rejected(stage._now, c)
-    nearest_m = stage._now.rejected_map.nearest_m(c.xyz_m, 0.0, NEAR_REJECTED_M, START_NS)
+    nearest_m = stage._now.rejected.static_map.nearest_m(c.xyz_m, 0.0, NEAR_REJECTED_M, START_NS)
     assert math.isfinite(nearest_m) == remembered

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from numba.core import config
 from numba.core.registry import CPUDispatcher
@@ -18,6 +19,7 @@ import stages.kernels
 from flow.compile_cache import cache_folder, cache_name
 from stages.kernels import calls, compiled
 from stages.kernels.compiled import CACHE_FOLDER, COMPILED
+from stages.kernels.geometry.so3 import nearly_rotation
 
 REPOSITORY = Path(__file__).resolve().parents[3]
 
@@ -49,6 +51,15 @@ def test_kernels_define_compiled_functions_only(kernels):
         functions = [value for value in own if callable(value) and not inspect.isclass(value)]
         if loaded not in (compiled, calls):  # the decorators themselves, and what loads the functions
             assert all(isinstance(value, CPUDispatcher) for value in functions), module.name
+
+
+def test_a_function_that_is_compiled_at_import_refuses_other_types_and_compiles_none():
+    read_only = np.eye(3)
+    read_only.setflags(write=False)
+    assert np.allclose(nearly_rotation(np.eye(3)), np.eye(3))
+    with pytest.raises(TypeError):
+        nearly_rotation(read_only)
+    assert len(nearly_rotation.signatures) == 1  # pyright: ignore
 
 
 def test_numba_uses_it_and_a_folder_that_cannot_be_created_is_no_error(tmp_path, monkeypatch):

@@ -145,7 +145,7 @@ def gate(message: RelativePose, name: str, gate: Gate, scene: ViewerScene) -> En
         if message.rotation_ns is not None:
             shares[2] = (message.stamp_ns - message.rotation_ns) * 1e-9 / limits.rotation_age_s
     if message.odom_yaw_sigma_rad is not None and gate.yaw == "none":
-        shares[3] = math.degrees(message.odom_yaw_sigma_rad) / limits.odom_yaw_sigma_deg
+        shares[3] = math.degrees(message.odom_yaw_sigma_rad) / limits.rotation_sigma_deg
     values = [1.0, *shares]
     yield plot(f"plots/gate/{name}", np.minimum(values, GATE_TOP), ["limit", *GATE_VALUES], GATE_COLOURS, dots=False)
     yield scene.status(5, "to the autopilot", state if reason is None else f"held back: {state}")

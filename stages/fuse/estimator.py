@@ -21,7 +21,7 @@ from stages.fuse.fix_covariance import FixCovariance, fix_covariance
 from stages.fuse.graph import InertialGraph
 from stages.fuse.measurement_queue import LATEST_NS, Measurement, MeasurementQueue
 from stages.fuse.settings import FuseErrors
-from stages.geometry.frames import Array64
+from stages.geometry.frames import Array64, heading_rad
 from stages.geometry.se3 import CHI2_999_3, mahalanobis2
 from stages.geometry.trajectory import VehicleTrajectory
 from stages.heading.autopilot_samples import AutopilotSamples
@@ -29,7 +29,7 @@ from stages.heading.earlier_run import EarlierHeading, EarlierRun
 from stages.heading.heading_memory import HeadingMemory
 from stages.heading.imu_buffer import ImuBuffer
 from stages.heading.inertial_heading import InertialHeading, bias_free_turn, turn_between
-from stages.heading.inertial_state import POSITION, VELOCITY, InertialState
+from stages.heading.inertial_state import POSITION, THETA, VELOCITY, InertialState, yaw_sigma_rad
 from stages.heading.odometry_heading import OdometryHeading, OdomYaw
 from stages.heading.ownership import Ownership, log_evidence
 from stages.heading.rotation_matches import RotationMatches, combine
@@ -139,7 +139,7 @@ class Estimator:
         """Yaw of the autopilot's frame in `map`; None: not known, or the object may be another one than the drone."""
         if self.suspect or not (self.odometry.confirmed or self.ownership.certain):
             return None
-        return self.odometry.odom_yaw
+        return self.odometry.axes
 
     @property
     def stamp_ns(self) -> int:
@@ -240,7 +240,7 @@ class Estimator:
             return
         if nis <= CHI2_999_3:
             self._rejected.clear()
-            self._add_odometry(stamp_ns, measured, float(noise[0, 0] + noise[1, 1]) / 2)
+            self._add_odometry(stamp_ns, measured, float(noise[0, 0] + noise[1, 1]) / 2, state)
         if self.graph.running:
             used = self._add_to_graph(max(stamp_ns, self.stamp_ns), z, noise, nis, state)
         else:
@@ -325,14 +325,22 @@ class Estimator:
         else:
             self.heading.add_vertical(up, sigma)
 
-    def _add_odometry(self, stamp_ns: int, z: Array64, variance_m2: float) -> None:
-        """The autopilot's own position at a LiDAR position: evidence for the heading while it is undecided."""
+    def _add_odometry(self, stamp_ns: int, z: Array64, variance_m2: float, state: InertialState) -> None:
+        """The autopilot's own position at a LiDAR position, evidence for the heading while it is undecided; its axes.
+
+        `state`: one row, at the LiDAR position, or at the horizon if that is later.
+        """
         own = self._autopilot.odometry(stamp_ns)
         self.heading.evidence = None
         if own is not None:
             self.odometry.add(stamp_ns, z, variance_m2, own.xyz_odom_m, own.segment)
             if not self.graph.running:
                 self.heading.evidence = self.odometry.evidence(stamp_ns, own.R_odom_drone)
+        own = self._autopilot.odometry(max(stamp_ns, self.stamp_ns))
+        if own is not None and self.graph.running:
+            sigma_rad = yaw_sigma_rad(state.R[0], state.covariance[0, THETA, THETA] + self.rotation_bias_rad2)
+            yaw_rad = math.remainder(state.yaw_rad[0] - heading_rad(own.R_odom_drone), 2 * math.pi)
+            self.odometry.add_attitude(OdomYaw(stamp_ns, yaw_rad, sigma_rad))
 
     def _use_rotation(self, rotation: RelativeRotation) -> None:
         if not (len(rotation.rotations) and self.known and self._vehicle.in_current_frame(rotation.stamp_ns)):

@@ -10,6 +10,10 @@ an uncertainty however long the drone flies:
 
     p(yaw) = (1 - o) N(yaw; psi + yaw_odom, sigma_psi^2 + sigma_c^2) + o / 2 pi
 
+The autopilot uses positions together with its attitude. Axes that differ from those of its attitude by the error of its
+compass suit it less, but are parallel to those of its own positions. While psi is not sharp, the axes are those of the
+attitude, by the yaw of the body that grd measures, once psi shows by the model above that the compass is right.
+
 Source: ours; Horn, JOSA A 4(4) (1987) for the fit.
 """
 
@@ -33,6 +37,8 @@ WANDER_M, WANDER_S = 0.1, 2.0  # of its position, by the noise of GPS, one axis,
 WORST_CHI2 = 3.0  # of the fit, for each degree of freedom
 LENGTH_SLACK = 0.35  # displacements that differ more are not of one motion
 CURRENT_NS = 3_000_000_000
+SHARP_RAD = math.radians(2.0)  # sigma of psi below which the axes are those of the motion
+COMPASS_RIGHT = 0.99  # probability from which the axes may be those of the attitude
 YAW_DRIFT_RADPS = math.radians(2.0) / 60  # heading drift of both odometries: autopilots and links, degrees per minute
 
 
@@ -86,18 +92,19 @@ class OdometryHeading:
         self._points: deque[tuple[int, Array64, float, Array64]] = deque()
         self._segment: int | None = None
         self._fit: OdomYaw | None = None  # of the present window
+        self._by_attitude: OdomYaw | None = None  # by the body's yaw and the autopilot's attitude
         self.odom_yaw: OdomYaw | None = None  # the most certain so far; it stays when the autopilot's odometry ends
         self.confirmed = False  # whether the object that is followed has moved as the odometry
 
     def restart(self) -> None:
         """Drop everything: another frame `map` or `odom`, or another object."""
         self._points.clear()
-        self._fit, self.odom_yaw, self.confirmed = None, None, False
+        self._fit, self._by_attitude, self.odom_yaw, self.confirmed = None, None, None, False
 
     def on_found(self) -> None:
         """An object is found that may be another drone: its motion has to confirm the yaw again."""
         self._points.clear()
-        self._fit, self.confirmed = None, False
+        self._fit, self._by_attitude, self.confirmed = None, None, False
 
     def start(self, known: OdomYaw | None) -> None:
         """Take a yaw that an earlier run knew; None: nothing."""
@@ -127,6 +134,27 @@ class OdometryHeading:
         self.confirmed = True
         if kept is None or new.sigma_rad <= kept.sigma_at(new.stamp_ns):
             self.odom_yaw = new
+
+    def add_attitude(self, measured: OdomYaw) -> None:
+        """The yaw of the axes of the autopilot's attitude in `map`, by the yaw of the body in `map`."""
+        kept = self._by_attitude
+        if kept is None or measured.sigma_rad <= kept.sigma_at(measured.stamp_ns):
+            self._by_attitude = measured
+
+    @property
+    def axes(self) -> OdomYaw | None:
+        """Yaw of the autopilot's axes in `map`: by motion, or by its attitude if that is sharper and not contradicted."""
+        motion, attitude = self.odom_yaw, self._by_attitude
+        if motion is None or attitude is None or motion.sigma_rad <= max(SHARP_RAD, attitude.sigma_rad):
+            return motion
+        return attitude if self._compass_right(motion, attitude) > COMPASS_RIGHT else motion
+
+    def _compass_right(self, motion: OdomYaw, attitude: OdomYaw) -> float:
+        """Probability that the autopilot's compass has an error of its sigma, not any error."""
+        off = math.remainder(attitude.yaw_rad - motion.yaw_rad, 2 * math.pi)
+        sigma = math.hypot(self._compass_sigma_rad, motion.sigma_rad, attitude.sigma_rad)
+        right = (1.0 - self._outliers) * math.exp(-0.5 * (off / sigma) ** 2) / sigma
+        return right / (right + self._outliers / math.sqrt(2 * math.pi))
 
     def evidence(self, stamp_ns: int, R_odom_drone: Array64) -> YawEvidence | None:
         """Yaw of the body at a time with the autopilot's attitude then; None: the motion does not show it."""

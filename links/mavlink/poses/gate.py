@@ -57,8 +57,7 @@ class PoseLimits(StrictModel):
     """Limits for sending a pose: one sigma of the worst axis, and age."""
 
     position_sigma_m: float = Field(default=0.35, gt=0, le=5)  # 95 % are within 2.8 sigma, 1 m
-    rotation_sigma_deg: float = Field(default=5.0, gt=0, le=15)
-    odom_yaw_sigma_deg: float = Field(default=2.0, gt=0, le=15)  # of the autopilot's axes, for positions without yaw
+    rotation_sigma_deg: float = Field(default=5.0, gt=0, le=15)  # for positions without yaw: that of their axes
     rotation_age_s: float = Field(default=2.0, gt=0, le=10)  # of the measured rotation, for poses with yaw
     age_s: float = Field(default=0.15, gt=0, le=0.3)  # of the pose at the time of sending
 

@@ -177,10 +177,8 @@ class PoseSender:
             self.axes_yaw_rad = self._odom_axes_yaw_rad(pose) or 0.0
 
     def _odom_axes_yaw_rad(self, pose: RelativePose) -> float | None:
-        """Yaw of the autopilot's own axes in `map`: by its motion if that is sharp, else by its attitude."""
-        sigma_rad = math.inf if pose.odom_yaw_sigma_rad is None else pose.odom_yaw_sigma_rad
-        uncertain = math.degrees(sigma_rad) > self._limits.odom_yaw_sigma_deg
-        if uncertain or pose.odom_yaw_rad == self._other_boot_rad:
+        """Yaw of the autopilot's own axes in `map`: as learnt, else by its attitude."""
+        if pose.odom_yaw_rad == self._other_boot_rad:
             pose = replace(pose, odom_yaw_rad=None)
         return odom_yaw_rad(pose, self.autopilot)
 

@@ -62,7 +62,7 @@ def position_reason(pose: RelativePose, now_ns: int, limits: PoseLimits) -> Reje
         return RejectReason.ODOM_YAW
     if not (math.isfinite(yaw_rad) and math.isfinite(sigma_rad)):
         return RejectReason.NOT_FINITE
-    if math.degrees(sigma_rad) > limits.odom_yaw_sigma_deg:
+    if math.degrees(sigma_rad) > limits.rotation_sigma_deg:
         return RejectReason.ODOM_YAW_SIGMA
     return age_reason(pose.stamp_ns, now_ns, limits)
 
@@ -89,7 +89,7 @@ def position_quality_percent(pose: RelativePose, limits: PoseLimits) -> int:
     if pose.estimate is None or pose.odom_yaw_sigma_rad is None:
         return 1
     position_m = math.sqrt(max(float(np.linalg.eigvalsh(_covariance_map_m2(pose))[-1]), 0.0))
-    yaw = math.degrees(pose.odom_yaw_sigma_rad) / limits.odom_yaw_sigma_deg
+    yaw = math.degrees(pose.odom_yaw_sigma_rad) / limits.rotation_sigma_deg
     return max(1, min(100, round(100 * (1 - max(position_m / limits.position_sigma_m, yaw)))))
 
 

@@ -152,3 +152,63 @@ def test_the_evidence_ends_with_the_fit():
     fly(odometry, times(0, 8))
     assert odometry.evidence(10 * S, np.eye(3)) is not None
     assert odometry.evidence(12 * S, np.eye(3)) is None
+
+
+# axes of the autopilot
+
+GENTLE = np.arange(0, 4, 0.2)
+
+
+def gentle_flight():
+    """Enough motion for a yaw of several degrees."""
+    odometry = heading()
+    fly(odometry, GENTLE)
+    assert math.radians(2.0) < odometry.odom_yaw.sigma_rad < math.radians(9.0)
+    return odometry
+
+
+def test_without_a_yaw_of_the_body_the_axes_are_those_of_the_motion():
+    odometry = gentle_flight()
+    assert odometry.axes is odometry.odom_yaw
+
+
+def test_the_axes_are_those_of_the_attitude_while_the_motion_shows_them_less_sharply():
+    odometry = gentle_flight()
+    attitude = OdomYaw(4 * S, TRUE_RAD + 0.1, math.radians(1.0))
+    odometry.add_attitude(attitude)
+    assert odometry.axes is attitude
+    fly(odometry, times(4, 30))
+    assert odometry.odom_yaw.sigma_rad < math.radians(2.0)
+    assert odometry.axes is odometry.odom_yaw
+
+
+@pytest.mark.parametrize("off_deg", [35.0, -90.0, 180.0])
+def test_an_attitude_that_the_motion_contradicts_is_not_used(off_deg):
+    odometry = gentle_flight()
+    odometry.add_attitude(OdomYaw(4 * S, TRUE_RAD + math.radians(off_deg), math.radians(1.0)))
+    assert odometry.axes is odometry.odom_yaw
+
+
+def test_the_attitude_alone_gives_no_axes():
+    odometry = heading()
+    odometry.add_attitude(OdomYaw(0, TRUE_RAD, math.radians(1.0)))
+    assert odometry.axes is None
+
+
+def test_another_object_drops_the_axes_of_the_attitude():
+    odometry = gentle_flight()
+    odometry.add_attitude(OdomYaw(4 * S, TRUE_RAD, math.radians(1.0)))
+    odometry.on_found()
+    assert odometry.axes is odometry.odom_yaw
+    odometry.restart()
+    assert odometry.axes is None
+
+
+def test_the_axes_follow_the_attitude_with_its_drift():
+    odometry = gentle_flight()
+    for t in range(5):
+        newest = OdomYaw((4 + t) * S, TRUE_RAD + 0.01 * t, math.radians(1.0))
+        odometry.add_attitude(newest)
+        assert odometry.axes is newest
+    odometry.add_attitude(OdomYaw(9 * S, TRUE_RAD + 0.5, math.radians(3.0)))
+    assert odometry.axes is newest

@@ -50,7 +50,7 @@ def test_a_position_needs_no_rotation(state: PoseState):
         (position(odom_yaw_rad=None), RejectReason.ODOM_YAW),
         (position(odom_yaw_sigma_rad=None), RejectReason.ODOM_YAW),
         (position(odom_yaw_rad=math.nan), RejectReason.NOT_FINITE),
-        (position(odom_yaw_sigma_rad=math.radians(2.1)), RejectReason.ODOM_YAW_SIGMA),
+        (position(odom_yaw_sigma_rad=math.radians(LIMITS.rotation_sigma_deg + 0.1)), RejectReason.ODOM_YAW_SIGMA),
     ],
 )
 def test_an_invalid_position_is_rejected_with_its_reason(pose: RelativePose, why: RejectReason):
@@ -92,4 +92,4 @@ def test_quality_decreases_with_both_sigmas():
     assert position_quality_percent(position(1e-12 * np.eye(3), odom_yaw_sigma_rad=0.0), LIMITS) == 100
     half = np.diag([(0.5 * LIMITS.position_sigma_m) ** 2, 1e-6, 1e-6])
     assert position_quality_percent(position(half, odom_yaw_sigma_rad=0.0), LIMITS) == 50
-    assert position_quality_percent(position(half, odom_yaw_sigma_rad=math.radians(1.5)), LIMITS) == 25
+    assert position_quality_percent(position(half, odom_yaw_sigma_rad=math.radians(0.75 * LIMITS.rotation_sigma_deg)), LIMITS) == 25

@@ -143,7 +143,7 @@ class OdometryHeading:
 
     @property
     def axes(self) -> OdomYaw | None:
-        """Yaw of the autopilot's axes in `map`: by motion, or by its attitude if that is sharper and not contradicted."""
+        """Yaw of the autopilot's axes in `map`: by motion, or by its attitude if that is sharper and agrees."""
         motion, attitude = self.odom_yaw, self._by_attitude
         if motion is None or attitude is None or motion.sigma_rad <= max(SHARP_RAD, attitude.sigma_rad):
             return motion

@@ -92,4 +92,5 @@ def test_quality_decreases_with_both_sigmas():
     assert position_quality_percent(position(1e-12 * np.eye(3), odom_yaw_sigma_rad=0.0), LIMITS) == 100
     half = np.diag([(0.5 * LIMITS.position_sigma_m) ** 2, 1e-6, 1e-6])
     assert position_quality_percent(position(half, odom_yaw_sigma_rad=0.0), LIMITS) == 50
-    assert position_quality_percent(position(half, odom_yaw_sigma_rad=math.radians(0.75 * LIMITS.rotation_sigma_deg)), LIMITS) == 25
+    three_quarters = math.radians(0.75 * LIMITS.rotation_sigma_deg)
+    assert position_quality_percent(position(half, odom_yaw_sigma_rad=three_quarters), LIMITS) == 25

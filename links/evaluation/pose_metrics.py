@@ -191,7 +191,7 @@ def pose_rotation(e: Evaluation) -> Value | None:
         return not_evaluated(f"truth gives no rotation: {truth.why_no_rotation}")
     if errors.empty:
         return not_evaluated(e.no_error().note)
-    known = _with_rotation(e, errors)
+    known = with_rotation(e, errors)
     if known.empty:
         return not_evaluated("the run has no rotation where truth has one")
     e.put_all({f"rmse_{axis}_deg": rms(np.degrees(known[axis])) for axis in (*EULER, "angle")}, len(known))
@@ -202,7 +202,7 @@ def pose_rotation(e: Evaluation) -> Value | None:
     return None
 
 
-def _with_rotation(e: Evaluation, errors: pd.DataFrame) -> pd.DataFrame:
+def with_rotation(e: Evaluation, errors: pd.DataFrame) -> pd.DataFrame:
     """Errors of the outputs whose rotation is known; a run that does not mark them has one in each."""
     marks = e.output.has_rotation
     return errors if marks is None else errors.loc[marks[errors.index]]
@@ -239,7 +239,7 @@ def covariance_consistency(e: Evaluation) -> Value | None:
     put_inside_95(e, "inside_95_share", errors.nees.to_numpy(), 3)
     if "pose_nees" not in errors:
         return not_evaluated("no 6x6 covariance with rotation in the run and in truth")
-    pose_nees = _with_rotation(e, errors).pose_nees.to_numpy()
+    pose_nees = with_rotation(e, errors).pose_nees.to_numpy()
     if not len(pose_nees):
         return not_evaluated(NO_ROTATION)
     if np.isnan(pose_nees).any():

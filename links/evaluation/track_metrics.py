@@ -27,7 +27,7 @@ from links.evaluation.evaluation import (
     not_applicable,
     not_evaluated,
 )
-from links.evaluation.pose_metrics import NO_MOMENT
+from links.evaluation.pose_metrics import NO_MOMENT, with_rotation
 from links.evaluation.run_data import OutputKind
 from links.evaluation.text_files import Stamps
 from stages.geometry.frames import Array64
@@ -186,7 +186,10 @@ def autopilot_gate(e: Evaluation) -> Value | None:
     e.put_all({"sendable_rmse_m": rms(sent.distance), "sendable_max_m": sent.distance.max()}, n)
     if "angle" not in sent:
         return not_evaluated("no rotation in the run and in truth")
-    e.put("sendable_max_deg", np.degrees(sent.angle.max()), n)
+    turned = with_rotation(e, sent)
+    if not len(turned):
+        return not_evaluated("no pose that the autopilot gate accepts has a rotation")
+    e.put("sendable_max_deg", np.degrees(turned.angle.max()), len(turned))
     return None
 
 

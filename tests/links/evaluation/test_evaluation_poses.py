@@ -311,6 +311,20 @@ def test_poses_that_the_autopilot_gate_accepts_are_evaluated_separately(tmp_path
     assert silent.values["sendable_max_m"].failed
 
 
+def test_an_accepted_position_has_no_error_of_rotation(tmp_path):
+    folder = make_run(tmp_path / "a", EIGHT_HZ, truth_at(EIGHT_HZ))
+    (folder / "truth_vehicle_drone.tum").write_text("# full pose\n" + lines(EIGHT_HZ, truth_at(EIGHT_HZ)))
+    yaw = np.where(EIGHT_HZ < 5.0, math.pi, math.radians(2.0))
+    e = []
+    for known in (EIGHT_HZ >= 5.0, EIGHT_HZ >= 99.0):
+        add_pose(folder, EIGHT_HZ, truth_at(EIGHT_HZ), yaw_quaternion(yaw), np.eye(6) * 0.01, EIGHT_HZ >= 1.0)
+        mark_rotations(folder, known)
+        e.append(evaluated(folder))
+    assert value(e[0], "sendable_max_deg") == pytest.approx(2.0)
+    assert value(e[1], "sendable_max_m") == pytest.approx(0.0, abs=1e-6)
+    assert reason(e[1], "sendable_max_deg") == "no pose that the autopilot gate accepts has a rotation"
+
+
 def test_a_drone_out_of_reach_has_errors_but_no_share_of_time(tmp_path):
     folder = make_run(tmp_path / "a", EIGHT_HZ, truth_at(EIGHT_HZ))
     times = np.arange(0, 10.005, 0.01)

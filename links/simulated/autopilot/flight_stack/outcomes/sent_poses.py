@@ -91,28 +91,29 @@ class SentPoses:
         return round(float(np.diff([*sent, max(until_ns, sent[-1])]).max()) * 1e-9, 2) if sent else None
 
     def errors(self, latest_ns: int) -> SentErrors:
-        """Errors of all poses. latest_ns: until then the truth is known."""
-        if not self._poses:
+        """Errors of the poses until latest_ns; after that the truth is not known."""
+        poses = [pose for pose in self._poses if pose.stamp_ns <= latest_ns]
+        if not poses:
             return SentErrors(np.empty(0), np.empty(0), *[np.empty(0, dtype=bool)] * 3)
-        stamps = np.minimum(np.array([pose.stamp_ns for pose in self._poses], dtype=np.int64), latest_ns)
+        stamps = np.array([pose.stamp_ns for pose in poses], dtype=np.int64)
         R_vehicle, t_vehicle = self._truth.T_world_vehicle(stamps)
         R_drone, t_drone = self._truth.T_world_drone(stamps)
         relative_m = np.einsum("nji,nj->ni", R_vehicle, t_drone - t_vehicle)
         R_map, t_map = self._map_vehicle(stamps)
         expected_m = t_map + np.einsum("nij,nj->ni", R_map, relative_m)
         R_expected = R_map @ np.swapaxes(R_vehicle, 1, 2) @ R_drone
-        axes_yaw = np.array([pose.axes_yaw_rad for pose in self._poses])
+        axes_yaw = np.array([pose.axes_yaw_rad for pose in poses])
         yaw = np.arctan2(R_expected[:, 1, 0], R_expected[:, 0, 0]) - axes_yaw
-        sent_yaw = np.array([pose.yaw_rad for pose in self._poses])
+        sent_yaw = np.array([pose.yaw_rad for pose in poses])
         without = np.isnan(sent_yaw)
         R_axes_map = np.array([rotation_z(-yaw_rad) for yaw_rad in axes_yaw.tolist()])
         expected_m = np.einsum("nij,nj->ni", R_axes_map, expected_m)
-        error_m = np.array([pose.xyz_m for pose in self._poses]) - expected_m
-        covariances = np.array([pose.covariance_m2 for pose in self._poses])
+        error_m = np.array([pose.xyz_m for pose in poses]) - expected_m
+        covariances = np.array([pose.covariance_m2 for pose in poses])
         distance2 = np.einsum("ni,ni->n", error_m, np.linalg.solve(covariances, error_m[:, :, None])[:, :, 0])
         error_deg = np.degrees(sent_yaw[~without] - yaw[~without])
         yaw_deg = np.abs((error_deg + 180) % 360 - 180)
-        sigma_deg = np.degrees(np.sqrt([pose.yaw_variance for pose in self._poses]))[~without]
+        sigma_deg = np.degrees(np.sqrt([pose.yaw_variance for pose in poses]))[~without]
         position_m = np.linalg.norm(error_m, axis=1)
         wrong = position_m > WRONG_M
         wrong[~without] |= yaw_deg > WRONG_DEG

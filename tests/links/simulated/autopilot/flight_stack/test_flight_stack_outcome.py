@@ -50,6 +50,18 @@ def test_a_pose_is_wrong_above_one_metre_or_ten_degrees(shift_m: float, yaw_deg:
     assert result.sent_yaw_worst_deg == pytest.approx(yaw_deg, abs=1.0)
 
 
+def test_a_pose_of_a_time_that_was_not_flown_does_not_count() -> None:
+    host = Host(3.0)
+    outcome = watched(host)
+    host.run(2.0)
+    sent(host, outcome)
+    before = outcome.result()
+    host.edit = lambda message, time_s: setattr(message, "time_usec", message.time_usec + 400_000)
+    now_ns = START_NS + host.ticks * 10_000_000
+    outcome.on_sent(Record("/autopilot/tx", now_ns, now_ns, bytes(host.pose(now_ns).pack(host._mav))), 0.0)
+    assert outcome.result() == before
+
+
 def test_a_drift_of_the_vehicles_odometry_is_no_error_of_the_pose() -> None:
     class Shifted(VehicleOdometry):
         def T_map_vehicle(self, stamp_ns):

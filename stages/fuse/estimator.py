@@ -30,6 +30,7 @@ from stages.heading.heading_memory import HeadingMemory
 from stages.heading.imu_buffer import ImuBuffer
 from stages.heading.inertial_heading import InertialHeading, bias_free_turn, turn_between
 from stages.heading.inertial_state import POSITION, THETA, VELOCITY, InertialState, yaw_sigma_rad
+from stages.heading.map_outage import MapOutage
 from stages.heading.odometry_heading import OdometryHeading, OdomYaw
 from stages.heading.ownership import Ownership, log_evidence
 from stages.heading.rotation_matches import RotationMatches, combine
@@ -58,6 +59,7 @@ class Estimator:
         self._autopilot = AutopilotSamples()
         self._memory = HeadingMemory(self.imu)
         self.earlier = EarlierRun(errors.changed_frames)
+        self._outage = MapOutage()
         self._queue = MeasurementQueue(self.imu, vehicle)
         self.resets, self.too_late = 0, 0
         self.fix_ns: int | None = None  # newest LiDAR position used
@@ -79,9 +81,13 @@ class Estimator:
 
     # input
 
-    def add_motion(self, motion: DroneMotion) -> None:
-        """Add an IMU interval with the autopilot's vertical and, while independent, its odometry."""
-        if not self.imu.add(motion):
+    def add_motion(self, motion: DroneMotion, fixed: bool) -> None:
+        """Add an IMU interval with the autopilot's vertical and, while independent, its odometry.
+
+        `fixed`: the map frame does not move; otherwise the interval is kept for the time after the outage.
+        """
+        self._outage.add_motion(motion)
+        if not fixed or not self.imu.add(motion):
             return
         self._autopilot.add(motion)
         if motion.gyro_bias is not None:
@@ -167,6 +173,17 @@ class Estimator:
         self._memory.forget()
         self.odometry.restart()
 
+    def begin_outage(self) -> None:
+        """The vehicle's motion is not known any more: another map frame begins, until it is known again."""
+        self._outage.begin(self._vehicle.newest_ns or 0)
+        self.earlier = EarlierRun(self._errors.changed_frames)
+        self.start_map()
+
+    def jump_map(self) -> None:
+        """The vehicle's odometry has jumped: another map frame begins, and it is not the one before."""
+        self._outage.end()
+        self.start_map()
+
     def start_map(self) -> None:
         """Another map frame begins: drop everything, also what waits for its time."""
         self.forget()
@@ -209,9 +226,13 @@ class Estimator:
         R_map_vehicle, t = self._vehicle.at(stamp_ns)
         z, covariance = R_map_vehicle @ fix.xyz_vehicle_m + t, fix_covariance(fix, self._vehicle, self._errors)
         self.newest_fix_ns = max(stamp_ns, self.newest_fix_ns or stamp_ns)
+        if self._vehicle.known_at(stamp_ns):
+            self.earlier.prior = self._outage.prior(stamp_ns) or self.earlier.prior
         self.earlier.add(stamp_ns, z, covariance.whole, self._velocity_map(fix))
         if self.odometry.odom_yaw is None:
             self.odometry.start(self.earlier.odom_yaw(stamp_ns))
+        if self.earlier.confirmed:
+            self._outage.end()
         earlier = self.earlier.heading(self.known and self.decided)
         if not self.known or earlier is not None:
             self._find(fix, z, covariance, earlier)
@@ -250,6 +271,8 @@ class Estimator:
             self.nis, self.fix_ns = nis, max(stamp_ns, self.fix_ns or stamp_ns)
             self.bias_covariance_m2 = covariance.bias
             self._by_imu = (self.graph.stamp_ns, self.graph.state) if self.graph.running else None
+            if self.graph.running and self.is_own:
+                self._outage.add_state(self.graph.stamp_ns, self.graph.state, self.odom_yaw)
 
     def _at_horizon(self, stamp_ns: int) -> InertialState:
         """State at a measurement that is not before the horizon, else at the horizon."""

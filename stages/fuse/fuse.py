@@ -102,7 +102,10 @@ class Fuse(Stage[FuseSettings]):
         """Pose of the vehicle in `map`."""
         valid = self._intake.is_valid(motion, "vehicle motion", motion.xyz_map_m, motion.R_map_vehicle)
         if valid and self._map_frame.add(motion):
-            self._estimator.start_map()
+            if self._map_was_fixed:
+                self._estimator.jump_map()
+            else:
+                self._estimator.start_map()
         yield from self._publish(motion)
 
     def on_drone_motion(self, motion: DroneMotion) -> Poses:
@@ -112,8 +115,8 @@ class Fuse(Stage[FuseSettings]):
         numbers = (motion.specific_force_drone_mps2, motion.angular_velocity_drone_radps, *noise, *up)
         own = motion.autopilot
         more = () if own is None else (own.xyz_odom_m, own.R_odom_drone, own.velocity_odom_mps)
-        if self._intake.is_valid(motion, "drone motion", *numbers, *more) and self._map_frame.is_fixed(motion.stamp_ns):
-            self._estimator.add_motion(motion)
+        if self._intake.is_valid(motion, "drone motion", *numbers, *more):
+            self._estimator.add_motion(motion, self._map_frame.is_fixed(motion.stamp_ns))
         yield from self._publish(motion)
 
     def on_prior(self, prior: HeadingPrior) -> Poses:
@@ -183,7 +186,10 @@ class Fuse(Stage[FuseSettings]):
         """The outputs at a point of the grid."""
         fixed = self._map_frame.is_fixed(now_ns)
         if fixed != self._map_was_fixed:  # from now on the map frame moves with the vehicle, or stands
-            self._estimator.start_map()
+            if fixed:
+                self._estimator.start_map()
+            else:
+                self._estimator.begin_outage()
         self._map_was_fixed = fixed
         self._estimator.pass_time(now_ns)
         yield from self._estimator.cue_factors

@@ -1,6 +1,7 @@
 """Heading of an earlier run of grd, after a restart in flight: one hypothesis, and the yaw of the autopilot's frame.
 
-It holds if the autopilot's frame has not changed meanwhile. A LiDAR position at the distance d from the prior's
+The same after an outage of the vehicle's motion, with the drone's own state before (`map_outage.py`). It holds if the
+autopilot's frame, or frame `map`, has not changed meanwhile. A LiDAR position at the distance d from the prior's
 decides, with the share s of changed frames, whose positions are anywhere within an area. So does the direction of
 flight at the angle a from the prior's: in a changed frame it is any.
 
@@ -73,11 +74,18 @@ class EarlierRun:
         prior, holds, log_ratio = self._at_fix
         return EarlierHeading(prior.yaw_map_rad, prior.sigma_rad, holds, log_ratio)
 
+    @property
+    def confirmed(self) -> bool:
+        """Whether enough LiDAR positions in a row agree with the prior."""
+        return self._agreeing >= AGREEING
+
     def odom_yaw(self, stamp_ns: int) -> OdomYaw | None:
         """Yaw of the autopilot's frame when enough LiDAR positions in a row agree with the prior."""
-        if self._agreeing < AGREEING or self._at_fix is None:
+        if not self.confirmed or self._at_fix is None:
             return None
         prior = self._at_fix[0]
+        if math.isnan(prior.yaw_map_odom_rad):
+            return None
         return OdomYaw(stamp_ns, prior.yaw_map_odom_rad, prior.sigma_rad)
 
 

@@ -104,13 +104,14 @@ class EarlierOdomFrame(Message):
 
 @message(schema=119)
 class HeadingPrior(Message):
-    """Yaw, position and velocity of the drone after a restart of grd in flight, by the autopilot's propagation since.
+    """Yaw, position and velocity of the drone, propagated since they were last known.
 
-    Valid if frame odom has not changed since the earlier run: then LiDAR position and velocity are near these.
+    After a restart of grd in flight by the autopilot, valid if frame odom has not changed since; after an outage of the
+    vehicle's motion by the drone's IMU, valid if frame `map` has not changed. LiDAR positions are then near.
     """
 
     yaw_map_rad: float  # of the body
-    yaw_map_odom_rad: float  # of frame odom, R_map_odom = Rz(yaw)
+    yaw_map_odom_rad: float  # of frame odom, R_map_odom = Rz(yaw); NaN: not known
     sigma_rad: float  # of both
     xyz_map_m: Vec3
     position_sigma_m: float  # one horizontal axis

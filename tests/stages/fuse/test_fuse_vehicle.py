@@ -76,15 +76,15 @@ def test_missing_vehicle_motion_ends_full_until_it_returns(driving):
     assert flown.wrong == 0
 
 
-def jumped(from_s, deg=115.0):
+def jumped(from_s, deg=115.0, xyz_m=(200.0, 0.0, 0.0)):
     """Events with another map frame from a time on."""
     R = rotation_z(math.radians(deg))
 
     def fault(events):
         for at_ns, port, message in events:
             if port == "motion" and message.stamp_ns >= ns(from_s):
-                xyz_m = R @ message.xyz_map_m + np.array([200.0, 0.0, 0.0])
-                message = dataclasses.replace(message, xyz_map_m=xyz_m, R_map_vehicle=R @ message.R_map_vehicle)
+                moved_m = R @ message.xyz_map_m + np.array(xyz_m)
+                message = dataclasses.replace(message, xyz_map_m=moved_m, R_map_vehicle=R @ message.R_map_vehicle)
             yield at_ns, port, message
 
     return fault
@@ -102,6 +102,48 @@ def test_a_jump_of_the_map_frame_resets_the_estimate(driving, silent_s):
     assert FULL in after(flown, 11.0)[0]
     assert flown.poses[-1].resets > next(p.resets for p in flown.poses if p.state is FULL)
     assert not any(p.state is FULL for p in flown.poses if 6.4 + silent_s < seconds(p.stamp_ns) < 6.6 + silent_s)
+
+
+# an outage of the vehicle's motion, by IMU alone
+
+OUTAGE_S = 20.0, 23.0
+
+
+def by_imu(seed, mps=5.0):
+    return ImuFlight(kind="manoeuvre", seed=seed, until_s=27.0, vehicle_mps=mps)
+
+
+def full_again_s(flown: Flown) -> float:
+    """From the end of the outage to the first pose with a rotation; infinite: none."""
+    stamps = [seconds(p.stamp_ns) for p in flown.poses if p.state is FULL and seconds(p.stamp_ns) > OUTAGE_S[1]]
+    return min(stamps, default=math.inf) - OUTAGE_S[1]
+
+
+def yaws_after(flown: Flown, from_s: float):
+    """Errors of the yaw [deg]."""
+    at_s = np.array(flown.at_s)[np.array(flown.full)]
+    return np.array(flown.yaw_deg)[at_s > from_s]
+
+
+@pytest.mark.parametrize("mps", [0.0, 5.0])
+def test_after_an_outage_in_the_same_frame_the_heading_is_known_again_soon(mps):
+    again_s = []
+    for seed in range(1, 7):
+        flown = fly(by_imu(seed, mps), fault=without(("motion",), *OUTAGE_S), frame=VEHICLE)
+        again_s.append(full_again_s(flown))
+        assert flown.wrong == 0
+        assert np.abs(yaws_after(flown, OUTAGE_S[1])).max() < 8.0
+    assert max(again_s) < 3.2
+
+
+@pytest.mark.parametrize("deg", [30.0, 115.0])
+def test_after_an_outage_another_frame_is_not_taken_for_the_same(deg):
+    """It is turned about the vehicle, as when an odometry restarts there with another yaw."""
+    gap, jump = without(("motion",), *OUTAGE_S), jumped(OUTAGE_S[0], deg, xyz_m=(0.0, 0.0, 0.0))
+    for seed in range(1, 7):
+        flown = fly(by_imu(seed, 0.0), fault=lambda events: jump(gap(events)), frame=VEHICLE)
+        assert flown.wrong == 0
+        assert math.isinf(full_again_s(flown))
 
 
 def test_odometry_in_large_map_coordinates_works(driving, unharmed):

@@ -253,7 +253,8 @@ def spinning(rate_radps, late_s, yaw_off_rad, sigma_rad):
                 angular_velocity_noise=np.full(3, 1e-3),
                 up_drone=None,
                 autopilot=None,
-            )
+            ),
+            fixed=True,
         )
     P = np.diag(np.array([0.05] * 3 + [0.05] * 3 + [0.1] * 3 + [0.1] * 3 + [1e-3] * 3) ** 2)
     yaw_rad = rate_radps * 1.5  # at 2.5 s

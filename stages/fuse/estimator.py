@@ -311,6 +311,7 @@ class Estimator:
             self.suspect = False
         if self.ownership.denied if self.graph.running else self.ownership.excluded:
             self.suspect = True
+            self._outage.end()
             self.forget()
 
     def _velocity_map(self, fix: DroneFix) -> Array64 | None:

@@ -36,8 +36,8 @@ class MapOutage:
         self._states.append((stamp_ns, state, axes))
 
     def begin(self, known_until_ns: int) -> None:
-        """The vehicle's motion is not known after a time."""
-        self._kept = next((kept for kept in reversed(self._states) if kept[0] <= known_until_ns), None)
+        """The vehicle's motion is not known after a time; without a state since an earlier outage its state is kept."""
+        self._kept = next((kept for kept in reversed(self._states) if kept[0] <= known_until_ns), self._kept)
         self._states.clear()
 
     def end(self) -> None:

@@ -82,5 +82,12 @@ def test_there_is_none_without_a_state_before_the_outage_or_when_it_is_old():
     assert it.prior(2 * S) is None
 
 
+def test_a_second_outage_without_a_state_in_between_keeps_that_of_the_first():
+    it = outage()
+    first = it.prior(3 * S)
+    it.begin(2 * S)
+    assert it.prior(3 * S).xyz_map_m == pytest.approx(first.xyz_map_m)
+
+
 def test_without_an_imu_the_position_is_hardly_known():
     assert outage(motions=0).prior(4 * S).position_sigma_m > 3.0 * outage().prior(4 * S).position_sigma_m

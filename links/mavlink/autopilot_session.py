@@ -347,6 +347,8 @@ class AutopilotSession:
 
     def _send(self, message: Any, pose: RelativePose | None = None) -> bool:
         """Send one message, of a pose if it is one. The lock is held."""
+        if pose is not None:
+            pose = self.poses.with_axes(pose)
         if pose is not None and self.poses.sends_yaw:  # a restart needs the yaw that its ATTITUDE has, right or wrong
             pose = dataclasses.replace(pose, odom_yaw_rad=None, odom_yaw_sigma_rad=None)
         return self._sender.send(

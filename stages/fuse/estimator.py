@@ -229,7 +229,7 @@ class Estimator:
         if self._vehicle.known_at(stamp_ns):
             self.earlier.prior = self._outage.prior(stamp_ns) or self.earlier.prior
         self.earlier.add(stamp_ns, z, covariance.whole, self._velocity_map(fix))
-        if self.odometry.odom_yaw is None:
+        if self.odometry.odom_yaw is None and self._autopilot.odometry(stamp_ns) is None:
             self.odometry.start(self.earlier.odom_yaw(stamp_ns))
         if self.earlier.confirmed:
             self._outage.end()
@@ -350,7 +350,7 @@ class Estimator:
             self.heading.add_vertical(up, sigma)
 
     def _add_odometry(self, stamp_ns: int, z: Array64, variance_m2: float, state: InertialState) -> None:
-        """The autopilot's own position at a LiDAR position, evidence for the heading while it is undecided; its axes.
+        """The autopilot's own position at a LiDAR position: evidence for the heading while it is undecided.
 
         `state`: one row, at the LiDAR position, or at the horizon if that is later.
         """
@@ -360,11 +360,18 @@ class Estimator:
             self.odometry.add(stamp_ns, z, variance_m2, own.xyz_odom_m, own.segment)
             if not self.graph.running:
                 self.heading.evidence = self.odometry.evidence(stamp_ns, own.R_odom_drone)
-        own = self._autopilot.odometry(max(stamp_ns, self.stamp_ns))
-        if own is not None and self.graph.running:
-            sigma_rad = yaw_sigma_rad(state.R[0], state.covariance[0, THETA, THETA] + self.rotation_bias_rad2)
-            yaw_rad = math.remainder(state.yaw_rad[0] - heading_rad(own.R_odom_drone), 2 * math.pi)
-            self.odometry.add_attitude(OdomYaw(stamp_ns, yaw_rad, sigma_rad))
+        if self.graph.running:
+            self._add_attitude(max(stamp_ns, self.stamp_ns), state)
+
+    def _add_attitude(self, stamp_ns: int, state: InertialState) -> None:
+        """The axes of the autopilot's attitude, by the yaw of the body; state: one row, at the time."""
+        own = self._autopilot.odometry(stamp_ns)
+        if own is None:
+            return
+        bias_rad2 = self.rotation_bias_rad2 if self.rotation_ns is not None else 0.0
+        sigma_rad = yaw_sigma_rad(state.R[0], state.covariance[0, THETA, THETA] + bias_rad2)
+        yaw_rad = math.remainder(state.yaw_rad[0] - heading_rad(own.R_odom_drone), 2 * math.pi)
+        self.odometry.add_attitude(OdomYaw(stamp_ns, yaw_rad, sigma_rad))
 
     def _use_rotation(self, rotation: RelativeRotation) -> None:
         if not (len(rotation.rotations) and self.known and self._vehicle.in_current_frame(rotation.stamp_ns)):

@@ -61,7 +61,7 @@ class MapOutage:
             stamp_ns=stamp_ns,
             yaw_map_rad=float(state.yaw_rad[0]),
             yaw_map_odom_rad=math.nan if axes is None else axes.yaw_rad,
-            sigma_rad=sigma_rad if axes is None else max(sigma_rad, axes.sigma_at(stamp_ns)),
+            sigma_rad=sigma_rad if axes is None else max(sigma_rad, axes.sigma_rad),
             xyz_map_m=state.xyz_m[0].copy(),
             position_sigma_m=_level_sigma(covariance[POSITION, POSITION]),
             velocity_map_mps=state.velocity_mps[0].copy(),

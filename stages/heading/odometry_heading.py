@@ -39,6 +39,7 @@ LENGTH_SLACK = 0.35  # displacements that differ more are not of one motion
 CURRENT_NS = 3_000_000_000
 SHARP_RAD = math.radians(2.0)  # sigma of psi below which the axes are those of the motion
 COMPASS_RIGHT = 0.99  # probability from which the axes may be those of the attitude
+COMPASS_SHOWN_RAD = math.radians(10.0)  # sigma of psi up to which it shows a compass that is 20 deg off, at two sigmas
 YAW_DRIFT_RADPS = math.radians(2.0) / 60  # heading drift of both odometries: autopilots and links, degrees per minute
 
 
@@ -104,7 +105,7 @@ class OdometryHeading:
     def on_found(self) -> None:
         """An object is found that may be another drone: its motion has to confirm the yaw again."""
         self._points.clear()
-        self._fit, self._by_attitude, self.confirmed = None, None, False
+        self._fit, self.confirmed = None, False
 
     def start(self, known: OdomYaw | None) -> None:
         """Take a yaw that an earlier run knew; None: nothing."""
@@ -145,15 +146,21 @@ class OdometryHeading:
     def axes(self) -> OdomYaw | None:
         """Yaw of the autopilot's axes in `map`: by motion, or by its attitude if that is sharper and agrees."""
         motion, attitude = self.odom_yaw, self._by_attitude
-        if motion is None or attitude is None or motion.sigma_rad <= max(SHARP_RAD, attitude.sigma_rad):
+        if motion is None or attitude is None:
             return motion
-        return attitude if self._compass_right(motion, attitude) > COMPASS_RIGHT else motion
+        motion_rad = motion.sigma_at(attitude.stamp_ns)
+        if not max(SHARP_RAD, attitude.sigma_rad) < motion_rad <= COMPASS_SHOWN_RAD:
+            return motion
+        off_rad = attitude.yaw_rad - motion.yaw_rad
+        return (
+            attitude if self._compass_probability(off_rad, motion_rad, attitude.sigma_rad) > COMPASS_RIGHT else motion
+        )
 
-    def _compass_right(self, motion: OdomYaw, attitude: OdomYaw) -> float:
-        """Probability that the autopilot's compass has an error of its sigma, not any error."""
-        off = math.remainder(attitude.yaw_rad - motion.yaw_rad, 2 * math.pi)
-        sigma = math.hypot(self._compass_sigma_rad, motion.sigma_rad, attitude.sigma_rad)
-        right = (1.0 - self._outliers) * math.exp(-0.5 * (off / sigma) ** 2) / sigma
+    def _compass_probability(self, off_rad: float, motion_rad: float, attitude_rad: float) -> float:
+        """Probability that the autopilot's compass has an error of its sigma, not any error; sigmas of both yaws."""
+        off_rad = math.remainder(off_rad, 2 * math.pi)
+        sigma_rad = math.hypot(self._compass_sigma_rad, motion_rad, attitude_rad)
+        right = (1.0 - self._outliers) * math.exp(-0.5 * (off_rad / sigma_rad) ** 2) / sigma_rad
         return right / (right + self._outliers / math.sqrt(2 * math.pi))
 
     def evidence(self, stamp_ns: int, R_odom_drone: Array64) -> YawEvidence | None:

@@ -5,7 +5,7 @@
     none      a position in the autopilot's own axes; its yaw comes from its compass. It needs no rotation of the drone
     measured  a pose with yaw, while cameras or the raw IMU measure it; its yaw comes from grd alone. The axes are
               parallel to the autopilot's own when the first pose since its boot is sent, by its motion if that shows
-              them within the limit, else by its attitude; without an attitude they are those of `map`. They are kept.
+              them to 2 deg, else by its attitude; without an attitude they are those of `map`. They are kept.
               After a restart in flight the attitude contains earlier poses: it chooses the axes, and measures nothing
 
 The reset counter is incremented with every jump of the pose, every change of the drone, and after every pause that the
@@ -36,6 +36,7 @@ from links.mavlink.poses.position_messages import position_odometry, position_vi
 from links.mavlink.poses.status_texts import StatusTexts
 from links.mavlink.profiles import ProfileName, YawOutput
 from links.mavlink.transport.framing import SEQUENCE
+from stages.heading.odometry_heading import SHARP_RAD
 from stages.messages import PoseState, RelativePose
 
 PoseMessage = Literal["odometry", "vision_position_estimate", "landing_target"]
@@ -77,6 +78,7 @@ class PoseSender:
         self._profile: ProfileName = profile
         self._poses_sent = self._yaw_reset = False  # since the autopilot's boot
         self._odom_yaw_rad: float | None = None  # of the newest pose that had one
+        self._first: RelativePose | None = None  # first pose sent without yaw since the estimate last jumped
         self._other_boot_rad: float | None = None  # yaw of its axes before its newest boot: not valid any more
         to_ekf: list[PoseMessage] = [kind for kind in self._kinds if kind != "landing_target"]
         self._to_ekf: tuple[PoseMessage, ...] = tuple(to_ekf) or self._kinds
@@ -101,14 +103,22 @@ class PoseSender:
 
     def turn_rad(self, pose: RelativePose) -> float | None:
         """Angle of the axes of a sent pose against the autopilot's own [rad]; None: not known."""
-        own_yaw_rad = self._odom_axes_yaw_rad(pose)
+        own_yaw_rad = self._odom_axes_yaw_rad(self.with_axes(pose))
         return None if own_yaw_rad is None else (self.axes_yaw_rad or 0.0) - own_yaw_rad
+
+    def with_axes(self, pose: RelativePose) -> RelativePose:
+        """A pose with the axes of the first one that was sent, until the estimate jumps: positions must not turn."""
+        first = self._first
+        if first is None or pose.odom_yaw_rad is None or _estimate_of(pose) != _estimate_of(first):
+            return pose
+        return replace(pose, odom_yaw_rad=first.odom_yaw_rad, odom_yaw_sigma_rad=first.odom_yaw_sigma_rad)
 
     def messages(self, pose: RelativePose, now_ns: int, link_reason: RejectReason | None = None) -> list[Any]:
         """Messages of one pose; none if the gate rejects it, or with a `link_reason`. Then call `on_sent`."""
         self.texts.on_state(pose.state, pose.reason, now_ns)
         if pose.odom_yaw_rad is not None:
             self._odom_yaw_rad = pose.odom_yaw_rad
+        pose = self.with_axes(pose)
         reasons: dict[PoseMessage, RejectReason | None] = {
             kind: self._reason(kind, pose, now_ns) or link_reason for kind in self._kinds
         }
@@ -130,7 +140,7 @@ class PoseSender:
     def on_boot(self) -> None:
         """The autopilot has booted: its axes are others, and their yaw has to be learnt again before a pose is sent."""
         self._poses_sent = self._yaw_reset = False
-        self._other_boot_rad, self.axes_yaw_rad = self._odom_yaw_rad, None
+        self._other_boot_rad, self.axes_yaw_rad, self._first = self._odom_yaw_rad, None, None
         self.fusion.on_boot()
 
     def on_estimator_status(self, message: Any, now_ns: int) -> None:
@@ -147,6 +157,8 @@ class PoseSender:
         self._newest_ns = pose.stamp_ns
         if not {message.get_type().lower() for message in sent} & set(self._to_ekf):
             return
+        if not self.sends_yaw and (self._first is None or _estimate_of(pose) != _estimate_of(self._first)):
+            self._first = pose
         self._sent = SentPose(now_ns, pose.stamp_ns, pose.resets, pose.track_id)
         self._incremented, self._poses_sent = False, True
         if not self._sending:
@@ -177,8 +189,10 @@ class PoseSender:
             self.axes_yaw_rad = self._odom_axes_yaw_rad(pose) or 0.0
 
     def _odom_axes_yaw_rad(self, pose: RelativePose) -> float | None:
-        """Yaw of the autopilot's own axes in `map`: as learnt, else by its attitude."""
-        if pose.odom_yaw_rad == self._other_boot_rad:
+        """Yaw of the autopilot's own axes in `map`: as learnt, with yaw if that is sharp, else by its attitude."""
+        sigma_rad = math.inf if pose.odom_yaw_sigma_rad is None else pose.odom_yaw_sigma_rad
+        unsharp = self.sends_yaw and sigma_rad > SHARP_RAD
+        if unsharp or pose.odom_yaw_rad == self._other_boot_rad:
             pose = replace(pose, odom_yaw_rad=None)
         return odom_yaw_rad(pose, self.autopilot)
 
@@ -229,3 +243,8 @@ class PoseSender:
             return position_odometry(pose, self.reset_counter, self._limits, attitude)
         assert attitude is not None  # PX4 has no VISION_POSITION_ESTIMATE
         return position_vision_estimate(pose, self.reset_counter, attitude)
+
+
+def _estimate_of(pose: RelativePose) -> tuple[int, int]:
+    """The same for poses between which the estimate has not jumped."""
+    return pose.resets, pose.track_id

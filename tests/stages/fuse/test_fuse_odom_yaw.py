@@ -8,6 +8,7 @@ import math
 import pytest
 
 from stages.fuse import Fuse
+from stages.geometry.frames import heading_rad
 from stages.messages import DroneMotion, PoseEstimate
 from tests.stages.fuse.fuse_inputs import poses_of
 from tests.stages.fuse.imu_flights import ImuFlight, seconds
@@ -38,6 +39,37 @@ def changed(events, change):
         if isinstance(m, DroneMotion) and seconds(m.stamp_ns) > CHANGED_S:
             m = dataclasses.replace(m, autopilot=change(m.autopilot))
         yield at_ns, port, m
+
+
+def of_the_attitude_rad(events, flight):
+    """(stamp, yaw of the axes of the autopilot's attitude in `map`) of each motion."""
+    return [
+        (m.stamp_ns, heading_rad(flight.truth(seconds(m.stamp_ns))[0]) - heading_rad(m.autopilot.R_odom_drone))
+        for _, _, m in motions(events)
+    ]
+
+
+def off_deg(pose, yaw_rad):
+    return math.degrees(abs(math.remainder(pose.odom_yaw_rad - yaw_rad, 2 * math.pi)))
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_with_cameras_the_axes_are_those_of_the_attitude_until_the_motion_shows_them(seed):
+    """A compass that is wrong by several degrees; the drone turns."""
+    turning = ImuFlight(kind="manoeuvre", seed=seed, until_s=10.0, odometry=True, compass_deg=4.0, rotations=True)
+    events = turning.events()
+    of_attitude = of_the_attitude_rad(events, turning)
+    known = [p for p in poses_of(Fuse(), events) if p.odom_yaw_rad is not None]
+    by_attitude = [p for p in known if p.odom_yaw_sigma_rad < math.radians(1.0)]
+    assert len(by_attitude) > 50
+    for pose in by_attitude[::5]:
+        off = off_deg(pose, at_time(of_attitude, pose.stamp_ns))
+        assert off < 3.0 * math.degrees(pose.odom_yaw_sigma_rad)
+        assert off < 2.0
+
+
+def at_time(rows, stamp_ns):
+    return min(rows, key=lambda row: abs(row[0] - stamp_ns))[1]
 
 
 def at(poses, t_s):

@@ -195,13 +195,35 @@ def test_the_attitude_alone_gives_no_axes():
     assert odometry.axes is None
 
 
-def test_another_object_drops_the_axes_of_the_attitude():
+def test_the_axes_stay_when_a_drone_is_found_again_and_end_with_the_frame():
     odometry = gentle_flight()
-    odometry.add_attitude(OdomYaw(4 * S, TRUE_RAD, math.radians(1.0)))
+    attitude = OdomYaw(4 * S, TRUE_RAD, math.radians(1.0))
+    odometry.add_attitude(attitude)
     odometry.on_found()
-    assert odometry.axes is odometry.odom_yaw
+    assert odometry.axes is attitude
     odometry.restart()
     assert odometry.axes is None
+
+
+def test_motion_that_is_sharper_than_the_attitude_gives_the_axes():
+    odometry = gentle_flight()
+    odometry.add_attitude(OdomYaw(4 * S, TRUE_RAD, 1.1 * odometry.odom_yaw.sigma_rad))
+    assert odometry.axes is odometry.odom_yaw
+
+
+@pytest.mark.parametrize(("off_deg", "used"), [(10.0, True), (22.0, False)])
+def test_the_attitude_is_used_while_its_compass_is_probably_right(off_deg, used):
+    odometry = gentle_flight()
+    attitude = OdomYaw(4 * S, odometry.odom_yaw.yaw_rad + math.radians(off_deg), math.radians(1.0))
+    odometry.add_attitude(attitude)
+    assert (odometry.axes is attitude) is used
+
+
+def test_motion_of_long_ago_shows_no_compass():
+    odometry = gentle_flight()
+    attitude = OdomYaw(604 * S, odometry.odom_yaw.yaw_rad, math.radians(1.0))
+    odometry.add_attitude(attitude)
+    assert odometry.axes is odometry.odom_yaw
 
 
 def test_the_axes_follow_the_attitude_with_its_drift():

@@ -120,6 +120,26 @@ def test_after_a_boot_no_position_is_sent_in_the_axes_of_before():
     assert len(sender.messages(learnt_again, learnt_again.stamp_ns)) == 1
 
 
+def test_while_the_estimate_does_not_jump_positions_keep_the_axes_of_the_first():
+    sender = PoseSender(("odometry",), PoseLimits(), yaw="none")
+    sender.autopilot.attitude = AutopilotAttitude(0.0, 0.0, 0.0, HOST0)
+    coarse, sharp = {"odom_yaw_sigma_rad": math.radians(4.0)}, {"odom_yaw_sigma_rad": math.radians(1.0)}
+
+    def sent(at_ms: int, **changes: Any) -> Any:
+        pose = good_pose(HOST0 + at_ms * MS, **changes)
+        (message,) = sender.messages(pose, pose.stamp_ns)
+        sender.on_sent(pose, pose.stamp_ns, [message])
+        return message
+
+    first = sent(0, odom_yaw_rad=0.0, **coarse)
+    same = sent(20, odom_yaw_rad=0.25, **sharp)
+    assert (same.x, same.y, same.pose_covariance) == (first.x, first.y, first.pose_covariance)
+    jumped = sent(40, odom_yaw_rad=0.25, resets=good_pose().resets + 1, **sharp)
+    assert jumped.reset_counter == first.reset_counter + 1
+    assert jumped.y != pytest.approx(first.y, abs=0.5)
+    assert sent(60, odom_yaw_rad=0.0, resets=good_pose().resets + 1, **coarse).y == jumped.y
+
+
 @pytest.mark.parametrize("was_sent", [True, False])
 def test_after_several_boots_no_position_is_sent_in_the_axes_of_the_first(was_sent: bool):
     sender = PoseSender(("odometry",), PoseLimits(), yaw="none")

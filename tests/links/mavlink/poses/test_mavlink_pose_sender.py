@@ -89,6 +89,13 @@ def test_a_learnt_yaw_of_the_autopilots_axes_counts_more_than_its_compass():
     assert yaw_ned_rad(output.sent[-1]) == pytest.approx(math.radians(60.0), abs=1e-6)
 
 
+def test_with_yaw_a_learnt_yaw_that_is_not_sharp_counts_less_than_the_attitude():
+    output = Output()
+    output.pose_sender.autopilot.attitude = AutopilotAttitude(0.0, 0.0, math.radians(60.0), HOST0)
+    output.pose(odom_yaw_rad=math.radians(25.0), odom_yaw_sigma_rad=math.radians(3.0))
+    assert yaw_ned_rad(output.sent[-1]) == pytest.approx(math.radians(60.0), abs=1e-6)
+
+
 @pytest.mark.parametrize("age_s", [None, 5.0])
 def test_without_a_recent_attitude_the_axes_are_those_of_map(age_s: float | None):
     output = Output()

@@ -175,7 +175,7 @@ def autopilot_gate(e: Evaluation) -> Value | None:
         e.put_share("sendable_share", held.current & np.append(sendable, False)[held["last"]])
     else:
         e.put_none(not_evaluated(NO_MOMENT), "sendable_share")
-    sent = errors[sendable[errors.index]]
+    sent = errors.loc[sendable[errors.index]]
     false, n = int(sent.false.sum()), len(sent)
     e.put("sendable_false", false, n)
     if false:

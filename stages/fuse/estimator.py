@@ -25,16 +25,16 @@ from stages.geometry.frames import Array64, heading_rad
 from stages.geometry.se3 import CHI2_999_3, mahalanobis2
 from stages.geometry.trajectory import VehicleTrajectory
 from stages.heading.autopilot_samples import AutopilotSamples
-from stages.heading.earlier_run import EarlierHeading, EarlierRun
 from stages.heading.heading_memory import HeadingMemory
 from stages.heading.imu_buffer import ImuBuffer
 from stages.heading.inertial_heading import InertialHeading, bias_free_turn, turn_between
 from stages.heading.inertial_state import POSITION, THETA, VELOCITY, InertialState, yaw_sigma_rad
-from stages.heading.map_outage import MapOutage
+from stages.heading.map_outage import KnownState, MapOutage
 from stages.heading.odometry_heading import OdometryHeading, OdomYaw
 from stages.heading.ownership import Ownership, log_evidence
 from stages.heading.rotation_matches import RotationMatches, combine
-from stages.messages import CueFactor, DroneCue, DroneFix, DroneMotion, RelativeRotation, VisualMotion
+from stages.heading.same_frame import PriorHeading, SameFrame
+from stages.messages import CueFactor, DroneCue, DroneFix, DroneMotion, HeadingPrior, RelativeRotation, VisualMotion
 
 TILT_TIME_S = 20.0  # time constant of the error of roll and pitch
 KEPT_NS = 15_000_000_000  # without a LiDAR position the estimate ends; the heading is remembered
@@ -58,8 +58,11 @@ class Estimator:
         self.odometry = OdometryHeading(math.radians(errors.compass_deg), errors.compass_outliers)
         self._autopilot = AutopilotSamples()
         self._memory = HeadingMemory(self.imu)
-        self.earlier = EarlierRun(errors.changed_frames)
+        self._same_frame = SameFrame(errors.changed_frames, math.pi)
         self._outage = MapOutage()
+        self._restart_prior: HeadingPrior | None = None
+        self._earlier_map = True  # `map` may be that of an earlier run
+        self._map_fixed = False  # `map` does not move with the vehicle
         self._queue = MeasurementQueue(self.imu, vehicle)
         self.resets, self.too_late = 0, 0
         self.fix_ns: int | None = None  # newest LiDAR position used
@@ -68,7 +71,6 @@ class Estimator:
         self._cameras_confirmed = False  # the graph was started with confirmed matches of both cameras
         self.nis = math.nan
         self.bias_covariance_m2 = np.zeros((3, 3))
-        self.rotation_bias_rad2 = np.zeros((3, 3))
         self._restart_filters()
 
     def _restart_filters(self) -> None:
@@ -78,6 +80,7 @@ class Estimator:
         self.ownership.restart(self.suspect)
         self._vertical_ns = 0
         self.rotation_ns = None
+        self.rotation_bias_rad2 = np.zeros((3, 3))
 
     # input
 
@@ -92,6 +95,11 @@ class Estimator:
         self._autopilot.add(motion)
         if motion.gyro_bias is not None:
             (self.graph if self.graph.running else self.heading).add_vertical_gyro_bias(motion.gyro_bias)
+
+    def add_restart_prior(self, prior: HeadingPrior) -> None:
+        """The drone by the autopilot since an earlier run, in the `map` of then."""
+        if self._earlier_map:
+            self._restart_prior = prior
 
     def add(self, measurement: Measurement) -> None:
         """Add a measurement; it is used when the horizon reaches its time."""
@@ -160,6 +168,12 @@ class Estimator:
         one = self.heading.decision() if self.decided else self.heading.bank.mean()
         return self.imu.propagate(one, np.ones(1), self.heading.stamp_ns, stamp_ns)
 
+    def change_track(self) -> None:
+        """Another object is followed: positions of the one before that wait for their time are not used."""
+        self._queue.drop_fixes()
+        if self.known:
+            self.lose()
+
     def lose(self) -> None:
         """Drop the position; the heading is remembered."""
         if self.decided:
@@ -168,25 +182,41 @@ class Estimator:
         self._drop()
 
     def forget(self) -> None:
-        """Drop the position and the remembered heading: a contradiction."""
+        """Drop the position, the remembered heading and the states for an outage: a contradiction."""
+        self._outage.forget()
+        self._forget_map()
+
+    def _forget_map(self) -> None:
+        """Drop what is known in frame map."""
         self._drop()
         self._memory.forget()
         self.odometry.restart()
 
     def begin_outage(self) -> None:
-        """The vehicle's motion is not known any more: another map frame begins, until it is known again."""
-        self._outage.begin(self._vehicle.newest_ns or 0)
-        self.earlier = EarlierRun(self._errors.changed_frames)
-        self.start_map()
+        """The vehicle's motion is not known any more: `map` moves with it, until it is known again."""
+        self._clear_map(math.pi)
+        self._map_fixed = False
+        if self._outage.begin(self._vehicle.newest_ns or 0):
+            self._forget_earlier_map()
 
     def jump_map(self) -> None:
         """The vehicle's odometry has jumped: another map frame begins, and it is not the one before."""
-        self._outage.end()
-        self.start_map()
+        self._outage.forget()
+        self._forget_earlier_map()
+        self._clear_map(math.pi)
 
-    def start_map(self) -> None:
-        """Another map frame begins: drop everything, also what waits for its time."""
-        self.forget()
+    def _forget_earlier_map(self) -> None:
+        self._restart_prior, self._earlier_map = None, False
+
+    def start_map(self, turn_rad: float) -> None:
+        """A map frame begins: that before an outage, maybe turned about the vehicle by up to an angle, or another."""
+        self._clear_map(turn_rad)
+        self._map_fixed = True
+
+    def _clear_map(self, turn_rad: float) -> None:
+        """Drop everything in `map`, also what waits for its time."""
+        self._same_frame = SameFrame(self._errors.changed_frames, turn_rad)
+        self._forget_map()
         self._queue.clear()
         self.imu.clear()
         self.cues.restart()
@@ -198,6 +228,7 @@ class Estimator:
         self.fix_ns, self.nis = None, math.nan
         self._by_imu = None
         self.cues.restart()
+        self._same_frame.restart()
         self._restart_filters()
 
     # measurements
@@ -213,6 +244,7 @@ class Estimator:
         if last_ns and not self.imu.is_current(stamp_ns) and stamp_ns - last_ns > FREE_NS:
             self.heading.restart_yaw()
             self.rotation_ns = None
+            self.rotation_bias_rad2 = np.zeros((3, 3))
 
     def _to_bank(self) -> None:
         """Go on with the bank, from the graph's state: the IMU has ended, or cameras give their first matches."""
@@ -226,16 +258,15 @@ class Estimator:
         R_map_vehicle, t = self._vehicle.at(stamp_ns)
         z, covariance = R_map_vehicle @ fix.xyz_vehicle_m + t, fix_covariance(fix, self._vehicle, self._errors)
         self.newest_fix_ns = max(stamp_ns, self.newest_fix_ns or stamp_ns)
-        if self._vehicle.known_at(stamp_ns):
-            self.earlier.prior = self._outage.prior(stamp_ns) or self.earlier.prior
-        self.earlier.add(stamp_ns, z, covariance.whole, self._velocity_map(fix))
+        if self._map_fixed:
+            outage = self._outage.prior(stamp_ns)
+            about_m, velocity = None if outage is None else t, self._velocity_map(fix)
+            self._same_frame.add(outage or self._restart_prior, stamp_ns, z, covariance.whole, velocity, about_m)
         if self.odometry.odom_yaw is None and self._autopilot.odometry(stamp_ns) is None:
-            self.odometry.start(self.earlier.odom_yaw(stamp_ns))
-        if self.earlier.confirmed:
-            self._outage.end()
-        earlier = self.earlier.heading(self.known and self.decided)
-        if not self.known or earlier is not None:
-            self._find(fix, z, covariance, earlier)
+            self.odometry.start(self._same_frame.odom_yaw(stamp_ns))
+        prior = self._same_frame.heading(self.known and self.decided)
+        if not self.known or prior is not None:
+            self._find(fix, z, covariance, prior)
             return
         late_ns = max(self.stamp_ns - stamp_ns, 0)
         if late_ns > LATEST_NS:
@@ -272,7 +303,9 @@ class Estimator:
             self.bias_covariance_m2 = covariance.bias
             self._by_imu = (self.graph.stamp_ns, self.graph.state) if self.graph.running else None
             if self.graph.running and self.is_own:
-                self._outage.add_state(self.graph.stamp_ns, self.graph.state, self.odom_yaw)
+                up = self.graph.state.R[0, 2]
+                bias_rad2 = float(up @ self.rotation_bias_rad2 @ up)
+                self._outage.add_state(KnownState(self.graph.stamp_ns, self.graph.state, bias_rad2, self.odom_yaw))
 
     def _at_horizon(self, stamp_ns: int) -> InertialState:
         """State at a measurement that is not before the horizon, else at the horizon."""
@@ -311,7 +344,6 @@ class Estimator:
             self.suspect = False
         if self.ownership.denied if self.graph.running else self.ownership.excluded:
             self.suspect = True
-            self._outage.end()
             self.forget()
 
     def _velocity_map(self, fix: DroneFix) -> Array64 | None:
@@ -320,18 +352,16 @@ class Estimator:
             return None
         return self._vehicle.to_map(fix.stamp_ns, fix.xyz_vehicle_m, fix.velocity_vehicle_mps)[1]
 
-    def _find(
-        self, fix: DroneFix, z: Array64, covariance: FixCovariance, earlier: EarlierHeading | None = None
-    ) -> None:
-        """Start at a LiDAR position; `earlier`: heading of an earlier run."""
+    def _find(self, fix: DroneFix, z: Array64, covariance: FixCovariance, prior: PriorHeading | None = None) -> None:
+        """Start at a LiDAR position; `prior`: heading before, if the frame is the same."""
         up = self._autopilot.up_drone(fix.stamp_ns)
         self._restart_filters()
         self.odometry.on_found()
-        if earlier is None:
+        if prior is None:
             memory = self._memory.yaw(fix.stamp_ns, z, covariance.whole)
         else:
-            memory = earlier.yaw_rad, earlier.sigma_rad, earlier.probability
-            self.ownership.log_ratio += earlier.log_ratio
+            memory = prior.yaw_rad, prior.sigma_rad, prior.probability
+            self.ownership.log_ratio += prior.log_ratio
         level = np.array([0.0, 0.0, 1.0]) if up is None else up
         self.heading.start(fix.stamp_ns, z, covariance.whole, self._velocity_map(fix), level, memory)
         self.fix_ns, self.bias_covariance_m2 = fix.stamp_ns, covariance.bias
@@ -368,8 +398,7 @@ class Estimator:
         own = self._autopilot.odometry(stamp_ns)
         if own is None:
             return
-        bias_rad2 = self.rotation_bias_rad2 if self.rotation_ns is not None else 0.0
-        sigma_rad = yaw_sigma_rad(state.R[0], state.covariance[0, THETA, THETA] + bias_rad2)
+        sigma_rad = yaw_sigma_rad(state.R[0], state.covariance[0, THETA, THETA] + self.rotation_bias_rad2)
         yaw_rad = math.remainder(state.yaw_rad[0] - heading_rad(own.R_odom_drone), 2 * math.pi)
         self.odometry.add_attitude(OdomYaw(stamp_ns, yaw_rad, sigma_rad))
 

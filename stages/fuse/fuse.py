@@ -29,7 +29,7 @@ from flow.stage import Settings, Stage
 from stages.fuse.estimator import Estimator
 from stages.fuse.intake import Intake
 from stages.fuse.jumps import Jumps
-from stages.fuse.map_frame import MapFrame
+from stages.fuse.map_frame import MapChange, MapFrame
 from stages.fuse.pose_message import MapEstimate, Status, lost, pose
 from stages.fuse.settings import FuseErrors, FuseLimits
 from stages.fuse.status import state_of, undecided_reason
@@ -100,12 +100,12 @@ class Fuse(Stage[FuseSettings]):
 
     def on_motion(self, motion: VehicleMotion) -> Poses:
         """Pose of the vehicle in `map`."""
-        valid = self._intake.is_valid(motion, "vehicle motion", motion.xyz_map_m, motion.R_map_vehicle)
-        if valid and self._map_frame.add(motion):
-            if self._map_was_fixed:
+        if self._intake.is_valid(motion, "vehicle motion", motion.xyz_map_m, motion.R_map_vehicle):
+            change = self._map_frame.add(motion)
+            if change is MapChange.JUMP:
                 self._estimator.jump_map()
-            else:
-                self._estimator.start_map()
+            elif change is MapChange.GAP:
+                self._estimator.start_map(self._map_frame.turn_rad)
         yield from self._publish(motion)
 
     def on_drone_motion(self, motion: DroneMotion) -> Poses:
@@ -120,11 +120,11 @@ class Fuse(Stage[FuseSettings]):
         yield from self._publish(motion)
 
     def on_prior(self, prior: HeadingPrior) -> Poses:
-        """Heading that an earlier run of grd knew."""
+        """The drone by the autopilot since an earlier run of grd."""
         sigmas = prior.sigma_rad, prior.position_sigma_m, prior.velocity_sigma_mps
         numbers = np.array([prior.yaw_map_rad, prior.yaw_map_odom_rad, *sigmas])
         if self._intake.is_valid(prior, "heading prior", prior.xyz_map_m, prior.velocity_map_mps, numbers):
-            self._estimator.earlier.prior = prior
+            self._estimator.add_restart_prior(prior)
         yield from self._publish(prior)
 
     def on_visual_motion(self, motion: VisualMotion) -> Poses:
@@ -147,8 +147,8 @@ class Fuse(Stage[FuseSettings]):
     def _add_fix(self, fix: DroneFix) -> None:
         if not self._track_continuity.accepts(fix.track_id, fix.stamp_ns):
             return
-        if fix.track_id != self._track_id and self._estimator.known:
-            self._estimator.lose()
+        if fix.track_id != self._track_id:
+            self._estimator.change_track()
         self._track_id = fix.track_id
         self._estimator.add(fix)
 
@@ -187,7 +187,7 @@ class Fuse(Stage[FuseSettings]):
         fixed = self._map_frame.is_fixed(now_ns)
         if fixed != self._map_was_fixed:  # from now on the map frame moves with the vehicle, or stands
             if fixed:
-                self._estimator.start_map()
+                self._estimator.start_map(self._map_frame.turn_rad)
             else:
                 self._estimator.begin_outage()
         self._map_was_fixed = fixed
@@ -227,7 +227,7 @@ class Fuse(Stage[FuseSettings]):
             axes = np.eye(6)
             axes[3:, 3:] = R.T  # position in drone axes
             whole = axes @ P[:6, :6] @ axes.T
-            whole[:3, :3] += e.rotation_bias_rad2 if e.rotation_ns is not None else 0.0
+            whole[:3, :3] += e.rotation_bias_rad2
             whole[3:, 3:] += R.T @ e.bias_covariance_m2 @ R
             if yaw_sigma_rad(R, whole) <= math.radians(self.settings.limits.yaw_sigma_deg):
                 return MapEstimate(now_ns, R, state.xyz_m[0], whole, *velocity)

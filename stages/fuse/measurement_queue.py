@@ -44,6 +44,11 @@ class MeasurementQueue:
         """Drop all."""
         self._waiting.clear()
 
+    def drop_fixes(self) -> None:
+        """Drop the LiDAR positions."""
+        self._waiting = [entry for entry in self._waiting if not isinstance(entry[2], DroneFix)]
+        heapq.heapify(self._waiting)
+
     def until(self, horizon_ns: int) -> list[Measurement]:
         """Remove and return the measurements up to a time, in order."""
         ready: list[Measurement] = []

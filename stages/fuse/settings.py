@@ -32,7 +32,7 @@ class FuseErrors(StrictModel):
     cue_time_s: float = Field(default=1.0, ge=0)  # time constant of the noise of cues
     cue_clock_s: float = Field(default=0.05, ge=0)  # of the latency of cues
     cue_seen_m: float = Field(default=0.1, ge=0)  # of the drone's position by LiDAR and IMU at a cue, each axis
-    changed_frames: float = Field(default=0.05, gt=0, lt=1)  # share of restarts while the autopilot changes its frame
+    changed_frames: float = Field(default=0.05, gt=0, lt=1)  # share of restarts and outages with another frame after
 
 
 class FuseLimits(StrictModel):

@@ -45,7 +45,8 @@ class VehicleTrajectory:
         self._poses: deque[tuple[int, Array64, Array64]] = deque(maxlen=KEPT)  # stamp, R_map_vehicle, t_map_vehicle
         self._rates: tuple[Array64, Array64] | None = None  # cache of `_newest_rates`
         self._newest: tuple[NDArray[np.int64], Array64, Array64] | None = None  # the NEWEST poses, for `at_each`
-        self._frame_start_ns = 0  # earlier poses lie in another frame
+        self.frame_start_ns = 0
+        """Stamp of the first pose in the current start frame; earlier ones lie in another."""
         self._cache: dict[int, tuple[Array64, Array64]] = {}  # results of `at` since the newest pose
 
     @property
@@ -100,7 +101,7 @@ class VehicleTrajectory:
 
     def _is_reachable(self, motion: VehicleMotion) -> bool:
         """Whether a pose is reachable from the poses before it."""
-        newest_ns, oldest_ns = self._poses[-1][0], max(self._poses[0][0], self._frame_start_ns)
+        newest_ns, oldest_ns = self._poses[-1][0], max(self._poses[0][0], self.frame_start_ns)
         speed_known = newest_ns - oldest_ns >= TOGETHER_NS
         expected, seconds = self.constant_velocity(motion.stamp_ns), (motion.stamp_ns - newest_ns) * 1e-9
         speed_mps = math.hypot(*self._newest_rates()[1].tolist()) if speed_known else None
@@ -125,7 +126,7 @@ class VehicleTrajectory:
             R, t = self.at(first.stamp_ns)
             R_map_source = nearest_rotation(R @ first.R_map_vehicle.T)
             self._T_map_source = R_map_source, t - R_map_source @ first.xyz_map_m
-        self._frame_start_ns = first.stamp_ns
+        self.frame_start_ns = first.stamp_ns
 
     def at(self, stamp_ns: int) -> tuple[Array64, Array64]:
         """R_map_vehicle (3, 3) and t_map_vehicle (3,) [m]; identity without any pose, constant before the first."""
@@ -172,7 +173,7 @@ class VehicleTrajectory:
             newest_ns, R, t = self._poses[-1]
             span_ns, R_then, t_then = TOGETHER_NS, R, t
             for then_ns, R_before, t_before in reversed(self._poses):
-                if then_ns < self._frame_start_ns:
+                if then_ns < self.frame_start_ns:
                     break
                 if newest_ns - then_ns >= TOGETHER_NS:
                     span_ns, R_then, t_then = newest_ns - then_ns, R_before, t_before
@@ -183,7 +184,7 @@ class VehicleTrajectory:
 
     def in_current_frame(self, stamp_ns: int) -> bool:
         """Whether the result of `at` for a time lies in the current frame map."""
-        return self._joined or stamp_ns >= self._frame_start_ns
+        return self._joined or stamp_ns >= self.frame_start_ns
 
     def rate_radps(self, stamp_ns: int) -> Array64:
         """Angular velocity (3,) in vehicle axes; zero where no pose gives it."""

@@ -1,7 +1,7 @@
 """The drone while the vehicle's motion is not known: its newest state before, propagated by its IMU.
 
 Frame `map` may be another one when the vehicle's motion is known again, because an odometry may restart in a gap. If it
-is the same one, LiDAR positions are near the propagated one: a prior, as after a restart of grd (`earlier_run.py`).
+is the same one, LiDAR positions are near the propagated one: a prior, as after a restart of grd (`same_frame.py`).
 
 Source: ours.
 """
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,25 +24,39 @@ from stages.messages import DroneMotion, HeadingPrior
 KEPT = 32  # states, one per LiDAR position: those of the last poses of the vehicle may be wrong already
 
 
+class KnownState(NamedTuple):
+    """State of the drone with a known heading, at a LiDAR position."""
+
+    stamp_ns: int
+    state: InertialState  # one row
+    yaw_bias_rad2: float  # variance of the yaw that the state's covariance does not contain
+    axes: OdomYaw | None  # of the autopilot
+
+
 class MapOutage:
-    """Recent states with a known heading, and the one that is propagated over an outage."""
+    """Recent states, and the one that is propagated over an outage."""
 
     def __init__(self) -> None:
-        self._states: deque[tuple[int, InertialState, OdomYaw | None]] = deque(maxlen=KEPT)
-        self._kept: tuple[int, InertialState, OdomYaw | None] | None = None
+        self._states: deque[KnownState] = deque(maxlen=KEPT)
+        self._kept: KnownState | None = None
         self._imu = ImuBuffer()
 
-    def add_state(self, stamp_ns: int, state: InertialState, axes: OdomYaw | None) -> None:
-        """A state (one row) at a LiDAR position, with the yaw of the autopilot's axes."""
-        self._states.append((stamp_ns, state, axes))
+    def add_state(self, known: KnownState) -> None:
+        """Add a state: a heading is known, so that the one before the outage is not needed any more."""
+        self._states.append(known)
+        self._kept = None
 
-    def begin(self, known_until_ns: int) -> None:
-        """The vehicle's motion is not known after a time; without a state since an earlier outage its state is kept."""
-        self._kept = next((kept for kept in reversed(self._states) if kept[0] <= known_until_ns), self._kept)
+    def begin(self, known_until_ns: int) -> bool:
+        """The vehicle's motion is not known after a time. Whether there is a state before it.
+
+        Without one since an earlier outage the state before that is kept.
+        """
+        self._kept = next((kept for kept in reversed(self._states) if kept.stamp_ns <= known_until_ns), self._kept)
         self._states.clear()
+        return self._kept is not None
 
-    def end(self) -> None:
-        """Drop everything: frame `map` is known to be another one, or the prior has been confirmed."""
+    def forget(self) -> None:
+        """Drop all states: they may be wrong, or lie in another frame."""
         self._states.clear()
         self._kept = None
 
@@ -51,12 +66,12 @@ class MapOutage:
 
     def prior(self, stamp_ns: int) -> HeadingPrior | None:
         """The propagated state; None: there is none, or it is too old."""
-        if self._kept is None or not 0 <= stamp_ns - self._kept[0] < SAME_NS:
+        if self._kept is None or not 0 <= stamp_ns - self._kept.stamp_ns < SAME_NS:
             return None
-        kept_ns, state, axes = self._kept
+        kept_ns, state, yaw_bias_rad2, axes = self._kept
         state = self._imu.propagate(state, np.ones(1), kept_ns, stamp_ns)
         covariance = state.covariance[0]
-        sigma_rad = math.sqrt(float(state.yaw_variance_rad2[0]))
+        sigma_rad = math.sqrt(float(state.yaw_variance_rad2[0]) + yaw_bias_rad2)
         return HeadingPrior(
             stamp_ns=stamp_ns,
             yaw_map_rad=float(state.yaw_rad[0]),

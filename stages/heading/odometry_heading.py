@@ -12,7 +12,7 @@ an uncertainty however long the drone flies:
 
 The autopilot uses positions together with its attitude. Axes that differ from those of its attitude by the error of its
 compass suit it less, but are parallel to those of its own positions. While psi is not sharp, the axes are those of the
-attitude, by the yaw of the body that grd measures, once psi shows by the model above that the compass is right.
+attitude, by the yaw of the body that grd measures, if psi excludes a wrong compass at two sigmas.
 
 Source: ours; Horn, JOSA A 4(4) (1987) for the fit.
 """
@@ -38,8 +38,7 @@ WORST_CHI2 = 3.0  # of the fit, for each degree of freedom
 LENGTH_SLACK = 0.35  # displacements that differ more are not of one motion
 CURRENT_NS = 3_000_000_000
 SHARP_RAD = math.radians(2.0)  # sigma of psi below which the axes are those of the motion
-COMPASS_RIGHT = 0.99  # probability from which the axes may be those of the attitude
-COMPASS_SHOWN_RAD = math.radians(10.0)  # sigma of psi up to which it shows a compass that is 20 deg off, at two sigmas
+WRONG_COMPASS_RAD = math.radians(20.0)  # as between ArduPilot's estimators: ATTITUDE_CHECK_THRESH_YAW_RAD
 YAW_DRIFT_RADPS = math.radians(2.0) / 60  # heading drift of both odometries: autopilots and links, degrees per minute
 
 
@@ -149,19 +148,11 @@ class OdometryHeading:
         if motion is None or attitude is None:
             return motion
         motion_rad = motion.sigma_at(attitude.stamp_ns)
-        if not max(SHARP_RAD, attitude.sigma_rad) < motion_rad <= COMPASS_SHOWN_RAD:
+        if motion_rad <= max(SHARP_RAD, attitude.sigma_rad):
             return motion
-        off_rad = attitude.yaw_rad - motion.yaw_rad
-        return (
-            attitude if self._compass_probability(off_rad, motion_rad, attitude.sigma_rad) > COMPASS_RIGHT else motion
-        )
-
-    def _compass_probability(self, off_rad: float, motion_rad: float, attitude_rad: float) -> float:
-        """Probability that the autopilot's compass has an error of its sigma, not any error; sigmas of both yaws."""
-        off_rad = math.remainder(off_rad, 2 * math.pi)
-        sigma_rad = math.hypot(self._compass_sigma_rad, motion_rad, attitude_rad)
-        right = (1.0 - self._outliers) * math.exp(-0.5 * (off_rad / sigma_rad) ** 2) / sigma_rad
-        return right / (right + self._outliers / math.sqrt(2 * math.pi))
+        off_rad = abs(math.remainder(attitude.yaw_rad - motion.yaw_rad, 2 * math.pi))
+        compass_is_right = off_rad + 2.0 * math.hypot(motion_rad, attitude.sigma_rad) < WRONG_COMPASS_RAD
+        return attitude if compass_is_right else motion
 
     def evidence(self, stamp_ns: int, R_odom_drone: Array64) -> YawEvidence | None:
         """Yaw of the body at a time with the autopilot's attitude then; None: the motion does not show it."""

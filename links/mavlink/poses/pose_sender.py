@@ -36,12 +36,11 @@ from links.mavlink.poses.position_messages import position_odometry, position_vi
 from links.mavlink.poses.status_texts import StatusTexts
 from links.mavlink.profiles import ProfileName, YawOutput
 from links.mavlink.transport.framing import SEQUENCE
-from stages.heading.odometry_heading import SHARP_RAD
+from stages.heading.odometry_heading import SHARP_RAD, WRONG_COMPASS_RAD
 from stages.messages import PoseState, RelativePose
 
 PoseMessage = Literal["odometry", "vision_position_estimate", "landing_target"]
 
-MAX_COMPASS_RAD = math.radians(20.0)  # as between ArduPilot's estimators before arming: ATTITUDE_CHECK_THRESH_YAW_RAD
 POSE_TIMEOUT_NS = 300_000_000  # the autopilot's timeout for poses
 
 
@@ -78,7 +77,7 @@ class PoseSender:
         self._profile: ProfileName = profile
         self._poses_sent = self._yaw_reset = False  # since the autopilot's boot
         self._odom_yaw_rad: float | None = None  # of the newest pose that had one
-        self._first: RelativePose | None = None  # first pose sent without yaw since the estimate last jumped
+        self._axes_pose: RelativePose | None = None  # first pose sent without yaw since the estimate last jumped
         self._other_boot_rad: float | None = None  # yaw of its axes before its newest boot: not valid any more
         to_ekf: list[PoseMessage] = [kind for kind in self._kinds if kind != "landing_target"]
         self._to_ekf: tuple[PoseMessage, ...] = tuple(to_ekf) or self._kinds
@@ -108,7 +107,7 @@ class PoseSender:
 
     def with_axes(self, pose: RelativePose) -> RelativePose:
         """A pose with the axes of the first one that was sent, until the estimate jumps: positions must not turn."""
-        first = self._first
+        first = self._axes_pose
         if first is None or pose.odom_yaw_rad is None or _estimate_of(pose) != _estimate_of(first):
             return pose
         return replace(pose, odom_yaw_rad=first.odom_yaw_rad, odom_yaw_sigma_rad=first.odom_yaw_sigma_rad)
@@ -140,7 +139,7 @@ class PoseSender:
     def on_boot(self) -> None:
         """The autopilot has booted: its axes are others, and their yaw has to be learnt again before a pose is sent."""
         self._poses_sent = self._yaw_reset = False
-        self._other_boot_rad, self.axes_yaw_rad, self._first = self._odom_yaw_rad, None, None
+        self._other_boot_rad, self.axes_yaw_rad, self._axes_pose = self._odom_yaw_rad, None, None
         self.fusion.on_boot()
 
     def on_estimator_status(self, message: Any, now_ns: int) -> None:
@@ -157,8 +156,8 @@ class PoseSender:
         self._newest_ns = pose.stamp_ns
         if not {message.get_type().lower() for message in sent} & set(self._to_ekf):
             return
-        if not self.sends_yaw and (self._first is None or _estimate_of(pose) != _estimate_of(self._first)):
-            self._first = pose
+        if not self.sends_yaw and (self._axes_pose is None or _estimate_of(pose) != _estimate_of(self._axes_pose)):
+            self._axes_pose = pose
         self._sent = SentPose(now_ns, pose.stamp_ns, pose.resets, pose.track_id)
         self._incremented, self._poses_sent = False, True
         if not self._sending:
@@ -225,7 +224,7 @@ class PoseSender:
         by_compass_rad = odom_yaw_rad(replace(pose, odom_yaw_rad=None), self.autopilot)
         if by_compass_rad is not None:
             off_rad = math.remainder(by_compass_rad - pose.odom_yaw_rad, math.tau)
-            return RejectReason.COMPASS if abs(off_rad) > MAX_COMPASS_RAD else None
+            return RejectReason.COMPASS if abs(off_rad) > WRONG_COMPASS_RAD else None
         return None
 
     def _message(self, kind: PoseMessage, pose: RelativePose) -> Any:

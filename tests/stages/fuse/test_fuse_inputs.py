@@ -162,6 +162,19 @@ def test_the_wanted_track_is_the_only_one_followed():
     assert poses_of(stage, [(0, "fix", fix(0.1, [1, 2, 10], track_id=4))])[-1].state is PoseState.POSITION_ONLY
 
 
+def test_positions_of_the_track_before_that_wait_for_their_time_are_not_used(flight):
+    stage = Fuse()
+    poses_of(stage, [event for event in flight.events() if event[0] < ns(8.0)])
+    near, far = (flight.truth(t)[1] + [off, 0, 0] for t, off in ((7.98, 0.0), (8.0, 40.0)))
+    events = [(0, "fix", fix(7.98, near, track_id=1)), (0, "track", track(8.0, TrackingState.LOST, 1))]
+    events += [(0, "fix", fix(8.0, far, track_id=2))]
+    poses = poses_of(
+        stage, [*events, *(event for event in flight.events() if event[1] != "fix" and event[0] > ns(8.0))]
+    )
+    first = next(pose for pose in poses if pose.track_id == 2 and pose.state is not LOST)
+    assert np.linalg.norm(first.xyz_vehicle_m - far) < 3.0
+
+
 def test_the_motion_of_another_track_is_no_evidence_for_the_new_one(flight):
     """What the ownership, the odometry and the bank have collected ends with the track."""
     stage = Fuse()

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
 
 from stages.fuse import Fuse
-from stages.fuse.map_frame import MapFrame
-from stages.geometry.frames import rotation_z
-from stages.messages import PoseState, VehicleMotion
-from tests.stages.fuse.fuse_inputs import late, outliers, without
+from stages.fuse.map_frame import MapChange, MapFrame
+from stages.geometry.frames import heading_rad, rotation_z
+from stages.messages import HeadingPrior, PoseState, VehicleMotion
+from tests.stages.fuse.fuse_inputs import late, outliers, poses_of, without
 from tests.stages.fuse.imu_flights import ImuFlight, ns, seconds
 from tests.stages.fuse.judged import CHI2_95, VEHICLE, Flown, fly, rms
 
@@ -77,13 +78,15 @@ def test_missing_vehicle_motion_ends_full_until_it_returns(driving):
 
 
 def jumped(from_s, deg=115.0, xyz_m=(200.0, 0.0, 0.0)):
-    """Events with another map frame from a time on."""
+    """Events with another map frame from a time on, turned about the vehicle's next place and displaced."""
     R = rotation_z(math.radians(deg))
 
     def fault(events):
+        about_m = None
         for at_ns, port, message in events:
             if port == "motion" and message.stamp_ns >= ns(from_s):
-                moved_m = R @ message.xyz_map_m + np.array(xyz_m)
+                about_m = message.xyz_map_m if about_m is None else about_m
+                moved_m = R @ (message.xyz_map_m - about_m) + about_m + np.array(xyz_m)
                 message = dataclasses.replace(message, xyz_map_m=moved_m, R_map_vehicle=R @ message.R_map_vehicle)
             yield at_ns, port, message
 
@@ -125,25 +128,160 @@ def yaws_after(flown: Flown, from_s: float):
     return np.array(flown.yaw_deg)[at_s > from_s]
 
 
-@pytest.mark.parametrize("mps", [0.0, 5.0])
-def test_after_an_outage_in_the_same_frame_the_heading_is_known_again_soon(mps):
+@dataclass
+class Following(ImuFlight):
+    """The drone flies about a place beside the vehicle; its LiDAR positions have a tracker's velocity."""
+
+    beside_m: float = 5.0
+
+    def _goal(self, t):
+        flown = super()._goal(t)
+        at = np.array([x + R @ [self.beside_m, 0.0, 0.0] for R, x in map(self.vehicle, t)])
+        at[:, :2] += 0.5 * (flown - flown[0])[:, :2]
+        at[:, 2] = flown[:, 2]
+        return at
+
+    def _fixes(self):
+        rng = np.random.default_rng([self.seed, 5])
+        for at, port, fix in super()._fixes():
+            if port == "fix":
+                t = seconds(fix.stamp_ns)
+                relative_m = [R.T @ (self.truth(s)[1] - x) for s in (t, t + 0.01) for R, x in [self.vehicle(s)]]
+                velocity = (relative_m[1] - relative_m[0]) / 0.01 + rng.normal(0, 0.4, 3)
+                fix = dataclasses.replace(fix, velocity_vehicle_mps=velocity)
+            yield at, port, fix
+
+
+@pytest.mark.parametrize(("mps", "late_s"), [(0.0, 0.0), (5.0, 0.0), (5.0, 0.2)])
+def test_after_an_outage_in_the_same_frame_the_heading_is_known_again_soon(mps, late_s):
+    """LiDAR positions that arrive during the outage are not compared, however late they are."""
     again_s = []
+    gap, delay = without(("motion",), *OUTAGE_S), late(("fix",), late_s)
     for seed in range(1, 7):
-        flown = fly(by_imu(seed, mps), fault=without(("motion",), *OUTAGE_S), frame=VEHICLE)
+        flown = fly(by_imu(seed, mps), fault=lambda events: delay(gap(events)), frame=VEHICLE)
         again_s.append(full_again_s(flown))
         assert flown.wrong == 0
         assert np.abs(yaws_after(flown, OUTAGE_S[1])).max() < 8.0
     assert max(again_s) < 3.2
 
 
-@pytest.mark.parametrize("deg", [30.0, 115.0])
-def test_after_an_outage_another_frame_is_not_taken_for_the_same(deg):
+@pytest.mark.parametrize(
+    ("mps", "deg", "beside_m"),
+    [(0.0, 8.0, 0.5), (0.0, 115.0, 5.0), (5.0, 60.0, 0.5), (5.0, 30.0, 5.0), (5.0, 60.0, 5.0)],
+)
+def test_after_an_outage_another_frame_is_not_taken_for_the_same(mps, deg, beside_m):
     """It is turned about the vehicle, as when an odometry restarts there with another yaw."""
-    gap, jump = without(("motion",), *OUTAGE_S), jumped(OUTAGE_S[0], deg, xyz_m=(0.0, 0.0, 0.0))
-    for seed in range(1, 7):
-        flown = fly(by_imu(seed, 0.0), fault=lambda events: jump(gap(events)), frame=VEHICLE)
+    gap, jump = without(("motion",), *OUTAGE_S), jumped(OUTAGE_S[1], deg, xyz_m=(0.0, 0.0, 0.0))
+    for seed in range(1, 4):
+        flown = fly(
+            Following(seed=seed, until_s=27.0, vehicle_mps=mps, beside_m=beside_m),
+            fault=lambda events: jump(gap(events)),
+            frame=VEHICLE,
+        )
         assert flown.wrong == 0
         assert math.isinf(full_again_s(flown))
+
+
+def test_a_second_outage_soon_after_the_first_has_the_same_prior():
+    twice = without(("motion",), 23.6, 27.0)(without(("motion",), *OUTAGE_S)(by_imu(1).events()))
+    assert prior_of(stage_after(twice), 25.5) is not None
+
+
+@pytest.mark.parametrize("silent_s", [0.0, 1.5])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_the_heading_of_an_earlier_run_does_not_hold_after_a_jump_of_the_map_frame(silent_s, seed):
+    """The drone is near the vehicle, about which the frame has turned."""
+    flight = Following(seed=seed, until_s=14.0, beside_m=1.0)
+    gap, jump = without(("motion",), 6.0, 6.0 + silent_s), jumped(6.0, 25.0, xyz_m=(0.0, 0.0, 0.0))
+
+    def with_priors(events):
+        made = []
+        for t in np.arange(0.3, 14.0, 0.1):
+            R, xyz_m, velocity = flight.truth(t)
+            sigma_m = math.hypot(0.5, 0.05 * (t + 2.0) ** 2)
+            prior = HeadingPrior(
+                stamp_ns=ns(t),
+                yaw_map_rad=heading_rad(R),
+                yaw_map_odom_rad=0.3,
+                sigma_rad=0.03,
+                xyz_map_m=xyz_m,
+                position_sigma_m=sigma_m,
+                velocity_map_mps=velocity,
+                velocity_sigma_mps=0.3,
+            )
+            made.append((ns(t) + 1, "prior", prior))
+        return sorted([*jump(gap(events)), *made], key=lambda event: event[0])
+
+    flown = fly(flight, fault=with_priors, frame=VEHICLE)
+    assert any(t < 6.0 for t, full in zip(flown.at_s, flown.full, strict=True) if full)
+    assert np.abs(yaws_after(flown, 6.0)).max(initial=0.0) < 10.0
+
+
+def stage_after(events) -> Fuse:
+    """The stage after these events."""
+    stage = Fuse()
+    poses_of(stage, events)
+    return stage
+
+
+def prior_of(stage: Fuse, t: float):
+    return stage._estimator._outage.prior(ns(t))
+
+
+def test_during_an_outage_nothing_is_compared_with_the_state_before():
+    """`map` moves with the vehicle then."""
+    stage = stage_after(without(("motion",), 20.0, 27.0)([e for e in by_imu(1).events() if e[0] < ns(20.95)]))
+    assert not stage._map_frame.is_fixed(ns(20.95))
+    assert prior_of(stage, 20.9) is not None
+    assert not stage._estimator._same_frame._first
+
+
+def slow(events):
+    """Poses of the vehicle at 5 Hz, 0.2 s late."""
+    return late(("motion",), 0.2)([e for e in events if e[1] != "motion" or e[2].stamp_ns // 10**7 % 20 == 0])
+
+
+@pytest.mark.parametrize("change", [slow, list])
+def test_after_a_jump_without_a_gap_the_frame_is_another_one_also_of_a_slow_odometry(change):
+    """It is turned about the vehicle; the prior would hold for a drone that is above it."""
+    events = by_imu(3, 0.0).events()
+    before = [e for e in change(events) if e[0] < ns(22.0)]
+    assert prior_of(stage_after(change(without(("motion",), 20.0, 27.0)(events))), 22.0) is not None
+    assert prior_of(stage_after(change(jumped(20.0, 25.0, xyz_m=(0.0, 0.0, 0.0))(before))), 22.0) is None
+
+
+def test_what_was_contradicted_is_no_prior_after_an_outage():
+    """The LiDAR's positions are those of another object from a time on."""
+
+    def moved(events):
+        for at_ns, port, m in events:
+            if port == "fix" and m.stamp_ns >= ns(19.0):
+                m = dataclasses.replace(m, xyz_vehicle_m=m.xyz_vehicle_m + np.array([4.0, 0.0, 0.0]))
+            yield at_ns, port, m
+
+    silent = without(("motion",), 20.4, 27.0)
+    events = by_imu(1, 0.0).events()
+    assert prior_of(stage_after(silent(events)), 22.0) is not None
+    assert prior_of(stage_after(moved(silent(events))), 22.0) is None
+
+
+@pytest.mark.parametrize(("deg", "same"), [(0.0, True), (25.0, False)])
+def test_the_axes_of_the_autopilot_are_known_again_in_the_same_frame_only(deg, same):
+    """Its odometry contains poses of grd from 15 s on, and is not used any more."""
+
+    def dependent(events):
+        for at_ns, port, m in events:
+            if port == "drone_motion" and m.stamp_ns >= ns(15.0):
+                m = dataclasses.replace(m, autopilot=None)
+            yield at_ns, port, m
+
+    flight = Following(seed=1, until_s=27.0, vehicle_mps=5.0, odometry=True)
+    turned = jumped(OUTAGE_S[1], deg, xyz_m=(0.0, 0.0, 0.0))
+    poses = poses_of(Fuse(), dependent(turned(without(("motion",), *OUTAGE_S)(flight.events()))))
+    before = next(p for p in poses if seconds(p.stamp_ns) > 19.5).odom_yaw_rad
+    after_ = poses[-1].odom_yaw_rad
+    assert before is not None
+    assert after_ == (pytest.approx(before) if same else None)
 
 
 def test_odometry_in_large_map_coordinates_works(driving, unharmed):
@@ -170,14 +308,34 @@ def filled(*motions):
 
 def test_one_jumping_pose_is_rejected_and_three_consistent_ones_are_a_new_map_frame():
     frame, new = filled(*(drive(0.02 * i) for i in range(20)))
-    assert new == [True, *[False] * 19]  # before the first pose the map frame was the vehicle's
+    assert new == [MapChange.GAP, *[None] * 19]  # before the first pose the map frame was the vehicle's
     assert not frame.add(drive(0.40, x=3.0))
     assert not frame.add(drive(0.42))
     assert frame.vehicle.at(ns(0.42))[1][0] == pytest.approx(6.0 * 0.42)
-    assert [frame.add(drive(t, x=3.0, yaw=0.5)) for t in (0.44, 0.46, 0.47, 0.48)] == [False, False, True, False]
+    assert [frame.add(drive(t, x=3.0, yaw=0.5)) for t in (0.44, 0.46, 0.47, 0.48)] == [None, None, MapChange.JUMP, None]
     R, t = frame.vehicle.at(ns(0.48))
     assert t[0] == pytest.approx(6.0 * 0.48 + 3.0)
     assert math.atan2(R[1, 0], R[0, 0]) == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize(
+    ("x", "yaw", "change"),
+    [
+        (0.0, 0.03, MapChange.GAP),
+        (0.0, 0.1, MapChange.JUMP),
+        (0.0, -0.1, MapChange.JUMP),
+        (2.0, 0.5, MapChange.GAP),
+        (4.0 * math.sqrt(2.0), math.pi / 2, MapChange.GAP),  # a quarter of a circle
+        (8.1, math.pi, MapChange.GAP),
+        (2.0, 0.7, MapChange.JUMP),
+    ],
+)
+def test_a_vehicle_that_was_silent_has_turned_no_more_than_along_an_arc(x, yaw, change):
+    def parked(t, x=0.0, yaw=0.0):
+        return dataclasses.replace(drive(t, yaw=yaw), xyz_map_m=np.array([x, 0.0, 0.0]))
+
+    frame, _ = filled(*(parked(0.02 * i) for i in range(5)))
+    assert [frame.add(parked(3.0 + 0.02 * i, x, yaw)) for i in range(3)] == [None, None, change]
 
 
 @pytest.mark.parametrize("off", [{"x": 2.0}, {"yaw": 0.7}])

@@ -9,7 +9,7 @@ import pytest
 
 from stages.heading.heading_memory import SAME_NS
 from stages.heading.inertial_state import SIZE, InertialState
-from stages.heading.map_outage import MapOutage
+from stages.heading.map_outage import KnownState, MapOutage
 from stages.heading.odometry_heading import OdomYaw
 from stages.messages import DroneMotion
 
@@ -38,13 +38,13 @@ def motion(k):
     )
 
 
-def outage(axes=None, known_until_s=1.05, motions=500):
+def outage(axes=None, known_until_s=1.05, motions=500, yaw_bias_rad2=0.0):
     """States at each 0.1 s until 1.5 s; an IMU that turns."""
     it = MapOutage()
     for k in range(motions):
         it.add_motion(motion(k))
     for k in range(16):
-        it.add_state(k * S // 10, state(0.1 * k), axes)
+        it.add_state(KnownState(k * S // 10, state(0.1 * k), yaw_bias_rad2, axes))
     it.begin(round(known_until_s * S))
     return it
 
@@ -78,8 +78,29 @@ def test_there_is_none_without_a_state_before_the_outage_or_when_it_is_old():
     assert outage(known_until_s=-1.0).prior(2 * S) is None
     assert outage().prior(S + SAME_NS) is None
     it = outage()
-    it.end()
+    it.forget()
     assert it.prior(2 * S) is None
+
+
+def test_a_state_after_the_outage_replaces_the_one_before():
+    it = outage()
+    it.add_state(KnownState(3 * S, state(3.0), 0.0, None))
+    assert it.prior(4 * S) is None
+    assert it.begin(4 * S)
+    assert it.prior(5 * S).xyz_map_m[0] == pytest.approx(3.0 + 2.0, abs=0.1)
+
+
+def test_what_was_contradicted_is_no_state_before_the_next_outage():
+    it = outage()
+    it.add_state(KnownState(3 * S, state(3.0), 0.0, None))
+    it.forget()
+    assert not it.begin(4 * S)
+    assert it.prior(5 * S) is None
+
+
+def test_the_variance_of_the_yaw_includes_its_bias():
+    sigma_rad = outage().prior(3 * S).sigma_rad
+    assert outage(yaw_bias_rad2=0.01).prior(3 * S).sigma_rad == pytest.approx(math.hypot(sigma_rad, 0.1))
 
 
 def test_a_second_outage_without_a_state_in_between_keeps_that_of_the_first():

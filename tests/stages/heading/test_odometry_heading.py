@@ -9,7 +9,7 @@ import pytest
 
 from stages.geometry.frames import rotation_z
 from stages.heading.inertial_bank import YawMixture
-from stages.heading.odometry_heading import OdometryHeading, OdomYaw, YawEvidence
+from stages.heading.odometry_heading import WRONG_COMPASS_RAD, OdometryHeading, OdomYaw, YawEvidence
 
 S = 1_000_000_000
 COMPASS_RAD = math.radians(7.0)
@@ -211,12 +211,16 @@ def test_motion_that_is_sharper_than_the_attitude_gives_the_axes():
     assert odometry.axes is odometry.odom_yaw
 
 
-@pytest.mark.parametrize(("off_deg", "used"), [(10.0, True), (22.0, False)])
-def test_the_attitude_is_used_while_its_compass_is_probably_right(off_deg, used):
-    odometry = gentle_flight()
-    attitude = OdomYaw(4 * S, odometry.odom_yaw.yaw_rad + math.radians(off_deg), math.radians(1.0))
-    odometry.add_attitude(attitude)
-    assert (odometry.axes is attitude) is used
+@pytest.mark.parametrize(("slack_deg", "used"), [(-0.5, True), (0.5, False)])
+def test_the_attitude_is_used_if_the_motion_excludes_a_wrong_compass_at_two_sigmas(slack_deg, used):
+    odometry, sigma_rad = gentle_flight(), math.radians(1.0)
+    limit_rad = WRONG_COMPASS_RAD - 2.0 * math.hypot(odometry.odom_yaw.sigma_at(4 * S), sigma_rad)
+    assert limit_rad > 0.0
+    for side in (-1.0, 1.0):
+        yaw_rad = odometry.odom_yaw.yaw_rad + side * (limit_rad + math.radians(slack_deg))
+        attitude = OdomYaw(4 * S, yaw_rad, sigma_rad)
+        odometry.add_attitude(attitude)
+        assert (odometry.axes is attitude) is used
 
 
 def test_motion_of_long_ago_shows_no_compass():

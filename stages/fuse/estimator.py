@@ -62,7 +62,7 @@ class Estimator:
         self._outage = MapOutage()
         self._restart_prior: HeadingPrior | None = None
         self._earlier_map = True  # `map` may be that of an earlier run
-        self._map_fixed = False  # `map` does not move with the vehicle
+        self.map_fixed = False  # `map` does not move with the vehicle
         self._queue = MeasurementQueue(self.imu, vehicle)
         self.resets, self.too_late = 0, 0
         self.fix_ns: int | None = None  # newest LiDAR position used
@@ -182,8 +182,9 @@ class Estimator:
         self._drop()
 
     def forget(self) -> None:
-        """Drop the position, the remembered heading and the states for an outage: a contradiction."""
+        """Drop the position, the remembered heading and the states before interruptions: a contradiction."""
         self._outage.forget()
+        self.forget_earlier_map()
         self._forget_map()
 
     def _forget_map(self) -> None:
@@ -194,27 +195,24 @@ class Estimator:
 
     def begin_outage(self) -> None:
         """The vehicle's motion is not known any more: `map` moves with it, until it is known again."""
-        self._clear_map(math.pi)
-        self._map_fixed = False
-        if self._outage.begin(self._vehicle.newest_ns or 0):
-            self._forget_earlier_map()
+        self._outage.begin(self._vehicle.newest_ns or 0)
+        self.forget_earlier_map()
+        self.start_map(math.pi)
 
     def jump_map(self) -> None:
-        """The vehicle's odometry has jumped: another map frame begins, and it is not the one before."""
+        """The vehicle's odometry has jumped: the map frame that begins is not the one before."""
         self._outage.forget()
-        self._forget_earlier_map()
-        self._clear_map(math.pi)
+        self.forget_earlier_map()
 
-    def _forget_earlier_map(self) -> None:
+    def forget_earlier_map(self) -> None:
+        """`map` need not be that of an earlier run any more."""
         self._restart_prior, self._earlier_map = None, False
 
     def start_map(self, turn_rad: float) -> None:
-        """A map frame begins: that before an outage, maybe turned about the vehicle by up to an angle, or another."""
-        self._clear_map(turn_rad)
-        self._map_fixed = True
+        """A map frame begins: that before an outage, maybe turned about the vehicle by up to an angle, or another.
 
-    def _clear_map(self, turn_rad: float) -> None:
-        """Drop everything in `map`, also what waits for its time."""
+        Everything in the one before is dropped, also what waits for its time.
+        """
         self._same_frame = SameFrame(self._errors.changed_frames, turn_rad)
         self._forget_map()
         self._queue.clear()
@@ -258,13 +256,13 @@ class Estimator:
         R_map_vehicle, t = self._vehicle.at(stamp_ns)
         z, covariance = R_map_vehicle @ fix.xyz_vehicle_m + t, fix_covariance(fix, self._vehicle, self._errors)
         self.newest_fix_ns = max(stamp_ns, self.newest_fix_ns or stamp_ns)
-        if self._map_fixed:
+        if self.map_fixed:
             outage = self._outage.prior(stamp_ns)
             about_m, velocity = None if outage is None else t, self._velocity_map(fix)
             self._same_frame.add(outage or self._restart_prior, stamp_ns, z, covariance.whole, velocity, about_m)
         if self.odometry.odom_yaw is None and self._autopilot.odometry(stamp_ns) is None:
             self.odometry.start(self._same_frame.odom_yaw(stamp_ns))
-        prior = self._same_frame.heading(self.known and self.decided)
+        prior = self._same_frame.heading(self.known and self.decided) if self.imu.covers(stamp_ns) else None
         if not self.known or prior is not None:
             self._find(fix, z, covariance, prior)
             return

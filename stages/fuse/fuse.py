@@ -105,6 +105,8 @@ class Fuse(Stage[FuseSettings]):
             if change is MapChange.JUMP:
                 self._estimator.jump_map()
             elif change is MapChange.GAP:
+                self._estimator.forget_earlier_map()
+            if change is not None:
                 self._estimator.start_map(self._map_frame.turn_rad)
         yield from self._publish(motion)
 
@@ -190,7 +192,7 @@ class Fuse(Stage[FuseSettings]):
                 self._estimator.start_map(self._map_frame.turn_rad)
             else:
                 self._estimator.begin_outage()
-        self._map_was_fixed = fixed
+        self._map_was_fixed = self._estimator.map_fixed = fixed
         self._estimator.pass_time(now_ns)
         yield from self._estimator.cue_factors
         self._estimator.cue_factors.clear()

@@ -27,6 +27,7 @@ YAW_NOISE_RAD = math.radians(3.0)  # of an odometry over a gap
 class MapChange(enum.Enum):
     """Why the map frame may be another one."""
 
+    START = enum.auto()  # the first pose: before, it was the vehicle frame
     GAP = enum.auto()  # the vehicle's odometry was silent, and may have restarted unnoticed
     JUMP = enum.auto()  # its poses contradict those before
 
@@ -48,7 +49,7 @@ class MapFrame:
         if not self.vehicle.add(motion):
             return None
         if before_ns is None or before is None:
-            return MapChange.GAP
+            return MapChange.START
         start_ns = self.vehicle.frame_start_ns
         turned_rad, possible_rad = _turns(before, self.vehicle.at(start_ns))
         self.turn_rad = min(2.0 * possible_rad, math.pi)  # the vehicle may have turned one way, the frame the other

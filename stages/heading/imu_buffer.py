@@ -54,6 +54,10 @@ class ImuBuffer:
         """Whether intervals keep arriving."""
         return bool(self._intervals) and now_ns - self._intervals[-1].stamp_ns < CURRENT_NS
 
+    def covers(self, stamp_ns: int) -> bool:
+        """Whether the motion since a time is measured from its start."""
+        return bool(self._intervals) and self._intervals[0].start_ns <= stamp_ns
+
     def clear(self) -> None:
         """Drop the intervals; the turns by images stay."""
         self._intervals.clear()

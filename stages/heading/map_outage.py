@@ -46,14 +46,10 @@ class MapOutage:
         self._states.append(known)
         self._kept = None
 
-    def begin(self, known_until_ns: int) -> bool:
-        """The vehicle's motion is not known after a time. Whether there is a state before it.
-
-        Without one since an earlier outage the state before that is kept.
-        """
+    def begin(self, known_until_ns: int) -> None:
+        """The vehicle's motion is not known after a time; without a state since an earlier outage its state is kept."""
         self._kept = next((kept for kept in reversed(self._states) if kept.stamp_ns <= known_until_ns), self._kept)
         self._states.clear()
-        return self._kept is not None
 
     def forget(self) -> None:
         """Drop all states: they may be wrong, or lie in another frame."""

@@ -56,7 +56,7 @@ def off_deg(pose, yaw_rad):
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_with_cameras_the_axes_are_those_of_the_attitude_until_the_motion_shows_them(seed):
     """A compass that is wrong by several degrees; the drone turns."""
-    turning = ImuFlight(kind="manoeuvre", seed=seed, until_s=10.0, odometry=True, compass_deg=4.0, rotations=True)
+    turning = ImuFlight(kind="manoeuvre", seed=seed, until_s=12.0, odometry=True, compass_deg=4.0, rotations=True)
     events = turning.events()
     of_attitude = of_the_attitude_rad(events, turning)
     known = [p for p in poses_of(Fuse(), events) if p.odom_yaw_rad is not None]

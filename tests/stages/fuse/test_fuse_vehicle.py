@@ -12,7 +12,7 @@ import pytest
 from stages.fuse import Fuse
 from stages.fuse.map_frame import MapChange, MapFrame
 from stages.geometry.frames import heading_rad, rotation_z
-from stages.messages import HeadingPrior, PoseState, VehicleMotion
+from stages.messages import HeadingPrior, MotionStatus, PoseState, VehicleMotion
 from tests.stages.fuse.fuse_inputs import late, outliers, poses_of, without
 from tests.stages.fuse.imu_flights import ImuFlight, ns, seconds
 from tests.stages.fuse.judged import CHI2_95, VEHICLE, Flown, fly, rms
@@ -187,34 +187,65 @@ def test_a_second_outage_soon_after_the_first_has_the_same_prior():
     assert prior_of(stage_after(twice), 25.5) is not None
 
 
-@pytest.mark.parametrize("silent_s", [0.0, 1.5])
+def with_priors(events, flight, turned_rad=0.0):
+    """Events with the drone by the autopilot since an earlier run of grd."""
+    made = []
+    for t in np.arange(0.3, flight.until_s, 0.1):
+        R, xyz_m, velocity = flight.truth(t)
+        prior = HeadingPrior(
+            stamp_ns=ns(t),
+            yaw_map_rad=heading_rad(R) + turned_rad,
+            yaw_map_odom_rad=0.3,
+            sigma_rad=0.03,
+            xyz_map_m=xyz_m,
+            position_sigma_m=math.hypot(0.5, 0.05 * (t + 2.0) ** 2),
+            velocity_map_mps=velocity,
+            velocity_sigma_mps=0.3,
+        )
+        made.append((ns(t) + 1, "prior", prior))
+    return sorted([*events, *made], key=lambda event: event[0])
+
+
+@pytest.mark.parametrize(("from_s", "silent_s", "mps"), [(6.0, 0.0, 0.0), (6.0, 1.5, 0.0), (0.7, 2.5, 1.0)])
 @pytest.mark.parametrize("seed", [1, 2])
-def test_the_heading_of_an_earlier_run_does_not_hold_after_a_jump_of_the_map_frame(silent_s, seed):
-    """The drone is near the vehicle, about which the frame has turned."""
-    flight = Following(seed=seed, until_s=14.0, beside_m=1.0)
-    gap, jump = without(("motion",), 6.0, 6.0 + silent_s), jumped(6.0, 25.0, xyz_m=(0.0, 0.0, 0.0))
+def test_the_heading_of_an_earlier_run_does_not_hold_in_another_map_frame(from_s, silent_s, mps, seed):
+    """The drone is near the vehicle, about which the frame has turned: without a gap, or in one."""
+    flight = Following(seed=seed, until_s=14.0, vehicle_mps=mps, beside_m=1.0)
+    gap, jump = without(("motion",), from_s, from_s + silent_s), jumped(from_s + silent_s, 25.0, xyz_m=(0.0, 0.0, 0.0))
+    flown = fly(flight, fault=lambda events: with_priors(jump(gap(events)), flight), frame=VEHICLE)
+    assert any(full and t < from_s for t, full in zip(flown.at_s, flown.full, strict=True)) is (from_s > 2.0)
+    assert np.abs(yaws_after(flown, from_s)).max(initial=0.0) < 10.0
 
-    def with_priors(events):
-        made = []
-        for t in np.arange(0.3, 14.0, 0.1):
-            R, xyz_m, velocity = flight.truth(t)
-            sigma_m = math.hypot(0.5, 0.05 * (t + 2.0) ** 2)
-            prior = HeadingPrior(
-                stamp_ns=ns(t),
-                yaw_map_rad=heading_rad(R),
-                yaw_map_odom_rad=0.3,
-                sigma_rad=0.03,
-                xyz_map_m=xyz_m,
-                position_sigma_m=sigma_m,
-                velocity_map_mps=velocity,
-                velocity_sigma_mps=0.3,
-            )
-            made.append((ns(t) + 1, "prior", prior))
-        return sorted([*jump(gap(events)), *made], key=lambda event: event[0])
 
-    flown = fly(flight, fault=with_priors, frame=VEHICLE)
-    assert any(t < 6.0 for t, full in zip(flown.at_s, flown.full, strict=True) if full)
-    assert np.abs(yaws_after(flown, 6.0)).max(initial=0.0) < 10.0
+def test_axes_of_an_earlier_run_end_with_a_contradiction():
+    """Its heading is wrong, as after a reset of the autopilot's yaw while grd was down; its position is right."""
+    flight = ImuFlight(kind="fast", seed=2, until_s=12.0)
+    poses = poses_of(Fuse(), with_priors(flight.events(), flight, turned_rad=math.pi / 2))
+    axes = [pose.odom_yaw_rad for pose in poses]
+    known = [k for k, yaw in enumerate(axes) if yaw is not None]
+    assert known
+    assert len(known) == known[-1] - known[0] + 1
+    assert axes[-1] is None
+
+
+def test_poses_of_the_vehicle_that_arrive_too_late_do_not_end_an_outage():
+    silent = [e for e in by_imu(1).events() if e[1] != "motion" or e[2].stamp_ns < ns(20.0)]
+    backlog = [(ns(21.6) + k, "motion", e[2]) for k, e in enumerate(by_imu(1).events()) if e[1] == "motion"]
+    backlog = [e for e in backlog if ns(20.7) <= e[2].stamp_ns < ns(20.9)]
+    stage = stage_after(sorted([*silent, *backlog], key=lambda e: e[0]))
+    assert len(backlog) >= 3
+    assert not stage._estimator.map_fixed
+    assert not stage._estimator._same_frame._first
+
+
+def test_the_heading_before_an_outage_waits_for_the_imu():
+    """Poses of the vehicle are withdrawn: positions since then are used before the IMU is."""
+    flight = Following(seed=1, until_s=23.5, beside_m=1.0)
+    withdrawn = next(m for _, port, m in flight.events() if port == "motion" and m.stamp_ns >= ns(19.05))
+    denied = dataclasses.replace(withdrawn, status=MotionStatus.DENIED)
+    events = sorted([*flight.events(), (ns(20.0) + 5, "motion", denied)], key=lambda event: event[0])
+    flown = fly(flight, fault=lambda _: events, frame=VEHICLE)
+    assert min(t for t, full in zip(flown.at_s, flown.full, strict=True) if full and t > 20.3) < 22.0
 
 
 def stage_after(events) -> Fuse:
@@ -308,7 +339,7 @@ def filled(*motions):
 
 def test_one_jumping_pose_is_rejected_and_three_consistent_ones_are_a_new_map_frame():
     frame, new = filled(*(drive(0.02 * i) for i in range(20)))
-    assert new == [MapChange.GAP, *[None] * 19]  # before the first pose the map frame was the vehicle's
+    assert new == [MapChange.START, *[None] * 19]  # before the first pose the map frame was the vehicle's
     assert not frame.add(drive(0.40, x=3.0))
     assert not frame.add(drive(0.42))
     assert frame.vehicle.at(ns(0.42))[1][0] == pytest.approx(6.0 * 0.42)

@@ -12,6 +12,7 @@ Source: ours; DESIGN, Fusion.
 from __future__ import annotations
 
 import math
+from collections import deque
 
 import numpy as np
 
@@ -38,6 +39,7 @@ from stages.messages import CueFactor, DroneCue, DroneFix, DroneMotion, HeadingP
 
 TILT_TIME_S = 20.0  # time constant of the error of roll and pitch
 KEPT_NS = 15_000_000_000  # without a LiDAR position the estimate ends; the heading is remembered
+RESTART_PRIORS = 64  # newest ones kept: LiDAR positions wait for LATEST_NS, priors come at up to 50 Hz
 FREE_NS = 1_000_000_000  # without IMU and vanishing points the yaw is dropped after this time
 LATE_MPS2 = 1.5  # change of velocity that moving a late position to the state's time ignores
 
@@ -60,7 +62,7 @@ class Estimator:
         self._memory = HeadingMemory(self.imu)
         self._same_frame = SameFrame(errors.changed_frames, math.pi)
         self._outage = MapOutage()
-        self._restart_prior: HeadingPrior | None = None
+        self._restart_priors: deque[HeadingPrior] = deque(maxlen=RESTART_PRIORS)
         self._earlier_map = True  # `map` may be that of an earlier run
         self.map_fixed = False  # `map` does not move with the vehicle
         self._queue = MeasurementQueue(self.imu, vehicle)
@@ -99,7 +101,7 @@ class Estimator:
     def add_restart_prior(self, prior: HeadingPrior) -> None:
         """The drone by the autopilot since an earlier run, in the `map` of then."""
         if self._earlier_map:
-            self._restart_prior = prior
+            self._restart_priors.append(prior)
 
     def add(self, measurement: Measurement) -> None:
         """Add a measurement; it is used when the horizon reaches its time."""
@@ -206,7 +208,8 @@ class Estimator:
 
     def forget_earlier_map(self) -> None:
         """`map` need not be that of an earlier run any more."""
-        self._restart_prior, self._earlier_map = None, False
+        self._restart_priors.clear()
+        self._earlier_map = False
 
     def start_map(self, turn_rad: float) -> None:
         """A map frame begins: that before an outage, maybe turned about the vehicle by up to an angle, or another.
@@ -258,8 +261,9 @@ class Estimator:
         self.newest_fix_ns = max(stamp_ns, self.newest_fix_ns or stamp_ns)
         if self.map_fixed:
             outage = self._outage.prior(stamp_ns)
+            nearest = min(self._restart_priors, key=lambda prior: abs(prior.stamp_ns - stamp_ns), default=None)
             about_m, velocity = None if outage is None else t, self._velocity_map(fix)
-            self._same_frame.add(outage or self._restart_prior, stamp_ns, z, covariance.whole, velocity, about_m)
+            self._same_frame.add(outage or nearest, stamp_ns, z, covariance.whole, velocity, about_m)
         if self.odometry.odom_yaw is None and self._autopilot.odometry(stamp_ns) is None:
             self.odometry.start(self._same_frame.odom_yaw(stamp_ns))
         prior = self._same_frame.heading(self.known and self.decided) if self.imu.covers(stamp_ns) else None

@@ -87,7 +87,6 @@ class Fuse(Stage[FuseSettings]):
         self._track_continuity = TrackContinuity(settings.track_id)
         self._intake, self._jumps = Intake(round(settings.lag_s * 1e9)), Jumps(settings.limits)
         self._track_id = 0
-        self._map_was_fixed = False
 
     @property
     def counters(self) -> Counters:
@@ -187,12 +186,12 @@ class Fuse(Stage[FuseSettings]):
     def _poses_at(self, now_ns: int, at_ns: int) -> Poses:
         """The outputs at a point of the grid."""
         fixed = self._map_frame.is_fixed(now_ns)
-        if fixed != self._map_was_fixed:  # from now on the map frame moves with the vehicle, or stands
+        if fixed != self._estimator.map_fixed:  # from now on the map frame moves with the vehicle, or stands
             if fixed:
                 self._estimator.start_map(self._map_frame.turn_rad)
             else:
                 self._estimator.begin_outage()
-        self._map_was_fixed = self._estimator.map_fixed = fixed
+        self._estimator.map_fixed = fixed
         self._estimator.pass_time(now_ns)
         yield from self._estimator.cue_factors
         self._estimator.cue_factors.clear()

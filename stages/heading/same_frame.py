@@ -84,7 +84,7 @@ class SameFrame:
         velocity_map_mps: Array64 | None,
         vehicle_map_m: Array64 | None,
     ) -> None:
-        """Add a LiDAR position with the newest prior, and the tracker's velocity if it is known.
+        """Add a LiDAR position with a prior of its time, and the tracker's velocity if it is known.
 
         `vehicle_map_m`: the frame may be turned about this position; None: a restart of grd.
         """
@@ -144,9 +144,9 @@ def _position_ratios(
     """L_p (n,) at turns (n,) about a position."""
     S = covariance_m2[:2, :2] + prior.position_sigma_m**2 * np.eye(2)
     expected_m = prior.xyz_map_m + 1e-9 * (stamp_ns - prior.stamp_ns) * prior.velocity_map_mps
-    beside_m = (expected_m - about_m)[:2]
+    relative_m = (expected_m - about_m)[:2]
     c, s = np.cos(turns_rad), np.sin(turns_rad)
-    turned_m = np.column_stack([c * beside_m[0] - s * beside_m[1], s * beside_m[0] + c * beside_m[1]])
+    turned_m = np.column_stack([c * relative_m[0] - s * relative_m[1], s * relative_m[0] + c * relative_m[1]])
     off_m = (xyz_map_m - about_m)[:2] - turned_m
     chi2 = np.einsum("ni,ij,nj->n", off_m, np.linalg.inv(S), off_m)
     return FRAME_AREA_M2 * np.exp(-0.5 * chi2) / (2 * math.pi * math.sqrt(np.linalg.det(S)))

@@ -13,6 +13,7 @@ from stages.fuse import Fuse
 from stages.fuse.settings import FuseErrors
 from stages.geometry.frames import heading_rad, rotation_z
 from stages.messages import DroneFix, HeadingPrior
+from tests.stages.fuse.fuse_inputs import late
 from tests.stages.fuse.imu_flights import ImuFlight, ns, seconds
 from tests.stages.fuse.judged import Flown, fly
 
@@ -90,6 +91,13 @@ def test_a_frame_that_has_turned_is_shown_by_the_direction_of_flight(turned_deg:
     flight = Passing(kind="hover", seed=1, until_s=6.0, wind_mps=1.5)
     flight.turned_deg = turned_deg
     assert not any(fly(flight).full)
+
+
+@pytest.mark.parametrize("late_s", [0.1, 0.3])
+def test_positions_that_arrive_late_are_compared_with_the_prior_of_their_time(late_s: float):
+    flown = fly(Restarted(kind="hover", seed=1, until_s=12.0, wind_mps=1.5), fault=late(("fix",), late_s))
+    assert flown.decided_s < 7.5
+    assert flown.wrong == 0
 
 
 def test_a_prior_that_comes_after_the_first_positions_is_used_too():

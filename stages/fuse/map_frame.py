@@ -20,8 +20,8 @@ from stages.geometry.frames import Array64, heading_rad
 from stages.geometry.trajectory import RECENT_NS, VehicleTrajectory
 from stages.messages import VehicleMotion
 
-TURNING_RADIUS_M = 4.0  # the least of a road vehicle, between its axles; EU 1230/2012 allows 12.5 m to its outside
-YAW_NOISE_RAD = math.radians(3.0)  # of an odometry over a gap
+TURNING_RADIUS_M = 4.0  # the least of a car, assumed; a vehicle that turns tighter is taken for a restarted odometry
+YAW_NOISE_RAD = math.radians(3.0)  # largest error of an odometry over a gap, assumed
 
 
 class MapChange(enum.Enum):

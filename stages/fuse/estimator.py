@@ -12,7 +12,6 @@ Source: ours; DESIGN, Fusion.
 from __future__ import annotations
 
 import math
-from collections import deque
 
 import numpy as np
 
@@ -26,20 +25,20 @@ from stages.geometry.frames import Array64, heading_rad
 from stages.geometry.se3 import CHI2_999_3, mahalanobis2
 from stages.geometry.trajectory import VehicleTrajectory
 from stages.heading.autopilot_samples import AutopilotSamples
+from stages.heading.earlier_frame import EarlierFrame
 from stages.heading.heading_memory import HeadingMemory
 from stages.heading.imu_buffer import ImuBuffer
 from stages.heading.inertial_heading import InertialHeading, bias_free_turn, turn_between
 from stages.heading.inertial_state import POSITION, THETA, VELOCITY, InertialState, yaw_sigma_rad
-from stages.heading.map_outage import KnownState, MapOutage
+from stages.heading.map_outage import KnownState
 from stages.heading.odometry_heading import OdometryHeading, OdomYaw
 from stages.heading.ownership import Ownership, log_evidence
 from stages.heading.rotation_matches import RotationMatches, combine
-from stages.heading.same_frame import PriorHeading, SameFrame
-from stages.messages import CueFactor, DroneCue, DroneFix, DroneMotion, HeadingPrior, RelativeRotation, VisualMotion
+from stages.heading.same_frame import PriorHeading
+from stages.messages import CueFactor, DroneCue, DroneFix, DroneMotion, RelativeRotation, VisualMotion
 
 TILT_TIME_S = 20.0  # time constant of the error of roll and pitch
 KEPT_NS = 15_000_000_000  # without a LiDAR position the estimate ends; the heading is remembered
-RESTART_PRIORS = 64  # newest ones kept: LiDAR positions wait for LATEST_NS, priors come at up to 50 Hz
 FREE_NS = 1_000_000_000  # without IMU and vanishing points the yaw is dropped after this time
 LATE_MPS2 = 1.5  # change of velocity that moving a late position to the state's time ignores
 
@@ -60,10 +59,7 @@ class Estimator:
         self.odometry = OdometryHeading(math.radians(errors.compass_deg), errors.compass_outliers)
         self._autopilot = AutopilotSamples()
         self._memory = HeadingMemory(self.imu)
-        self._same_frame = SameFrame(errors.changed_frames, math.pi)
-        self._outage = MapOutage()
-        self._restart_priors: deque[HeadingPrior] = deque(maxlen=RESTART_PRIORS)
-        self._earlier_map = True  # `map` may be that of an earlier run
+        self.earlier = EarlierFrame(errors.changed_frames)
         self.map_fixed = False  # `map` does not move with the vehicle
         self._queue = MeasurementQueue(self.imu, vehicle)
         self.resets, self.too_late = 0, 0
@@ -91,17 +87,12 @@ class Estimator:
 
         `fixed`: the map frame does not move; otherwise the interval is kept for the time after the outage.
         """
-        self._outage.add_motion(motion)
+        self.earlier.add_motion(motion)
         if not fixed or not self.imu.add(motion):
             return
         self._autopilot.add(motion)
         if motion.gyro_bias is not None:
             (self.graph if self.graph.running else self.heading).add_vertical_gyro_bias(motion.gyro_bias)
-
-    def add_restart_prior(self, prior: HeadingPrior) -> None:
-        """The drone by the autopilot since an earlier run, in the `map` of then."""
-        if self._earlier_map:
-            self._restart_priors.append(prior)
 
     def add(self, measurement: Measurement) -> None:
         """Add a measurement; it is used when the horizon reaches its time."""
@@ -185,8 +176,7 @@ class Estimator:
 
     def forget(self) -> None:
         """Drop the position, the remembered heading and the states before interruptions: a contradiction."""
-        self._outage.forget()
-        self.forget_earlier_map()
+        self.earlier.forget()
         self._forget_map()
 
     def _forget_map(self) -> None:
@@ -197,26 +187,15 @@ class Estimator:
 
     def begin_outage(self) -> None:
         """The vehicle's motion is not known any more: `map` moves with it, until it is known again."""
-        self._outage.begin(self._vehicle.newest_ns or 0)
-        self.forget_earlier_map()
+        self.earlier.begin_outage(self._vehicle.newest_ns or 0)
         self.start_map(math.pi)
-
-    def jump_map(self) -> None:
-        """The vehicle's odometry has jumped: the map frame that begins is not the one before."""
-        self._outage.forget()
-        self.forget_earlier_map()
-
-    def forget_earlier_map(self) -> None:
-        """`map` need not be that of an earlier run any more."""
-        self._restart_priors.clear()
-        self._earlier_map = False
 
     def start_map(self, turn_rad: float) -> None:
         """A map frame begins: that before an outage, maybe turned about the vehicle by up to an angle, or another.
 
         Everything in the one before is dropped, also what waits for its time.
         """
-        self._same_frame = SameFrame(self._errors.changed_frames, turn_rad)
+        self.earlier.start_frame(turn_rad)
         self._forget_map()
         self._queue.clear()
         self.imu.clear()
@@ -229,7 +208,7 @@ class Estimator:
         self.fix_ns, self.nis = None, math.nan
         self._by_imu = None
         self.cues.restart()
-        self._same_frame.restart()
+        self.earlier.restart_object()
         self._restart_filters()
 
     # measurements
@@ -260,13 +239,10 @@ class Estimator:
         z, covariance = R_map_vehicle @ fix.xyz_vehicle_m + t, fix_covariance(fix, self._vehicle, self._errors)
         self.newest_fix_ns = max(stamp_ns, self.newest_fix_ns or stamp_ns)
         if self.map_fixed:
-            outage = self._outage.prior(stamp_ns)
-            nearest = min(self._restart_priors, key=lambda prior: abs(prior.stamp_ns - stamp_ns), default=None)
-            about_m, velocity = None if outage is None else t, self._velocity_map(fix)
-            self._same_frame.add(outage or nearest, stamp_ns, z, covariance.whole, velocity, about_m)
+            self.earlier.add_position(stamp_ns, z, covariance.whole, self._velocity_map(fix), t)
         if self.odometry.odom_yaw is None and self._autopilot.odometry(stamp_ns) is None:
-            self.odometry.start(self._same_frame.odom_yaw(stamp_ns))
-        prior = self._same_frame.heading(self.known and self.decided) if self.imu.covers(stamp_ns) else None
+            self.odometry.start(self.earlier.odom_yaw(stamp_ns))
+        prior = self.earlier.heading(self.known and self.decided) if self.imu.covers(stamp_ns) else None
         if not self.known or prior is not None:
             self._find(fix, z, covariance, prior)
             return
@@ -307,7 +283,7 @@ class Estimator:
             if self.graph.running and self.is_own:
                 up = self.graph.state.R[0, 2]
                 bias_rad2 = float(up @ self.rotation_bias_rad2 @ up)
-                self._outage.add_state(KnownState(self.graph.stamp_ns, self.graph.state, bias_rad2, self.odom_yaw))
+                self.earlier.add_state(KnownState(self.graph.stamp_ns, self.graph.state, bias_rad2, self.odom_yaw))
 
     def _at_horizon(self, stamp_ns: int) -> InertialState:
         """State at a measurement that is not before the horizon, else at the horizon."""

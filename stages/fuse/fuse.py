@@ -102,9 +102,9 @@ class Fuse(Stage[FuseSettings]):
         if self._intake.is_valid(motion, "vehicle motion", motion.xyz_map_m, motion.R_map_vehicle):
             change = self._map_frame.add(motion)
             if change is MapChange.JUMP:
-                self._estimator.jump_map()
+                self._estimator.earlier.forget()  # the frame that begins is another one
             elif change is MapChange.GAP:
-                self._estimator.forget_earlier_map()
+                self._estimator.earlier.forget_earlier_run()
             if change is not None:
                 self._estimator.start_map(self._map_frame.turn_rad)
         yield from self._publish(motion)
@@ -125,7 +125,7 @@ class Fuse(Stage[FuseSettings]):
         sigmas = prior.sigma_rad, prior.position_sigma_m, prior.velocity_sigma_mps
         numbers = np.array([prior.yaw_map_rad, prior.yaw_map_odom_rad, *sigmas])
         if self._intake.is_valid(prior, "heading prior", prior.xyz_map_m, prior.velocity_map_mps, numbers):
-            self._estimator.add_restart_prior(prior)
+            self._estimator.earlier.add_restart_prior(prior)
         yield from self._publish(prior)
 
     def on_visual_motion(self, motion: VisualMotion) -> Poses:

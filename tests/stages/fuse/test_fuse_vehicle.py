@@ -235,7 +235,7 @@ def test_poses_of_the_vehicle_that_arrive_too_late_do_not_end_an_outage():
     stage = stage_after(sorted([*silent, *backlog], key=lambda e: e[0]))
     assert len(backlog) >= 3
     assert not stage._estimator.map_fixed
-    assert not stage._estimator._same_frame._first
+    assert not stage._estimator.earlier._same_frame._first
 
 
 def test_the_heading_before_an_outage_waits_for_the_imu():
@@ -256,7 +256,7 @@ def stage_after(events) -> Fuse:
 
 
 def prior_of(stage: Fuse, t: float):
-    return stage._estimator._outage.prior(ns(t))
+    return stage._estimator.earlier._outage.prior(ns(t))
 
 
 def test_during_an_outage_nothing_is_compared_with_the_state_before():
@@ -264,7 +264,7 @@ def test_during_an_outage_nothing_is_compared_with_the_state_before():
     stage = stage_after(without(("motion",), 20.0, 27.0)([e for e in by_imu(1).events() if e[0] < ns(20.95)]))
     assert not stage._map_frame.is_fixed(ns(20.95))
     assert prior_of(stage, 20.9) is not None
-    assert not stage._estimator._same_frame._first
+    assert not stage._estimator.earlier._same_frame._first
 
 
 def slow(events):

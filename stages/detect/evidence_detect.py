@@ -26,8 +26,9 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from flow.stage import Settings, Stage
-from stages.cues.evidence import CueEvidence, CueWeights, ObjectPath, ObjectState
+from stages.cues.evidence import CueWeights
 from stages.detect.candidate import SAME_PASS_NS, START_SPEED_MPS, Alternative, Candidate, Observation
+from stages.detect.candidate_cues import CandidateCues
 from stages.detect.candidate_messages import (
     Classified,
     candidate_log,
@@ -36,7 +37,6 @@ from stages.detect.candidate_messages import (
     log_odds_of,
 )
 from stages.detect.candidate_table import CandidateTable, positions_of
-from stages.detect.flight import scatter_m
 from stages.detect.observations import ObservationFinder, ObservationLimits, Observations, Slice
 from stages.detect.reacquire import reacquired_candidate, without_duplicates
 from stages.detect.rejected import Criteria, RejectedObservations
@@ -74,10 +74,6 @@ MAX_STATIC = 64  # static objects remembered
 # only where they would be accepted in its place.
 HYSTERESIS_NATS = 1.65
 AT_REST_MPS = np.zeros(3)
-COMPARED_NS = 500_000_000  # a cue is compared with a candidate observed this recently,
-COMPARED_PASSES = 5  # in so many scan passes
-CUE_MARGIN_NATS = 0.5  # below the threshold of acceptance
-CUE_PASSES = 3  # scan passes without which cues accept no candidate: before, a repeated false return is possible
 STATIC_NS = 60_000_000_000  # how long a static object is remembered
 
 
@@ -96,7 +92,7 @@ class _State:
 
     finder: ObservationFinder
     travel: Travel
-    cues: CueEvidence
+    cues: CandidateCues
     trail: VehicleTrajectory = field(default_factory=VehicleTrajectory)
     telemetry: DetectorTelemetry = field(default_factory=DetectorTelemetry)
     table: CandidateTable = field(default_factory=CandidateTable)
@@ -167,9 +163,10 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
         )
         finder = ObservationFinder(limits, settings.unit.profile)
         travel = Travel(math.radians(settings.sweep_deg - 3.0), math.radians(0.5))
-        self._now = _State(finder, travel, CueEvidence(settings.cues, settings.furthest_m))
         self._accept_nats = log_odds_of(settings.accept_probability)
         self._follow_up_nats = log_odds_of(settings.follow_up_probability)
+        cues = CandidateCues(settings.cues, settings.furthest_m, self._accept_nats, self._follow_up_nats)
+        self._now = _State(finder, travel, cues)
         self._criteria = Criteria(settings.model, self._follow_up_nats, settings.span_m, settings.free_space)
 
     def on_motion(self, motion: VehicleMotion) -> None:
@@ -190,15 +187,7 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
 
     def on_cue(self, cue: DroneCue) -> CueState:
         """Add a measurement of another sensor, and compare it with the drones that the LiDAR alone would accept."""
-        now = self._now
-        drones = [
-            _object(c)
-            for c in now.table
-            if c.scan_passes >= COMPARED_PASSES
-            and abs(cue.stamp_ns - c.seen_ns) < COMPARED_NS
-            and c.own_log_odds >= self._accept_nats
-        ]
-        return now.cues.add(cue, now.trail, drones)
+        return self._now.cues.add(cue, self._now.trail, self._now.table)
 
     def on_pulses(self, pulses: SweptPulses) -> Iterator[CandidateLog | Candidates | Detections]:
         """Process one slice: classify the observations that it completes and publish changes."""
@@ -333,7 +322,7 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
         prediction = self._predict(c.features)
         c.alternative = ALTERNATIVES[prediction.alternative]
         c.single_log_odds = c.own_log_odds = prediction.log_odds
-        remark = self._add_cues(now, c)
+        remark = now.cues.add_to(c, now.trail, now.table)
         others_nats = self._others_nats(now, c)
         c.log_odds = c.single_log_odds - others_nats
         if others_nats >= LEAST_NATS:
@@ -353,37 +342,6 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
         """What other candidates take from the log-odds: one at most is the drone, P = o / (1 + sum of all odds o)."""
         rivals = now.table.rivals_of(c, self.settings.clear_m)
         return math.log1p(sum_in_order([math.exp(other.single_log_odds) for other in rivals]))
-
-    def _add_cues(self, now: _State, c: Candidate) -> str:
-        """Add the evidence of cues to the log-odds: their lowest of the last seconds, so that a short match is none.
-
-        A cue is of one object: it adds nothing to others while it matches an accepted candidate. What the cues add
-        that are not proven to be of this candidate ends below the threshold of acceptance. Returns the remark for
-        people.
-        """
-        if not now.cues.known:
-            c.cue_nats = None
-            return ""
-        state = _object(c)
-        nats, of_proven, remark = now.cues.nats(state, now.trail, c.stamp_ns, c.proven_cues)
-        if not remark:
-            c.cue_nats = None
-            return ""
-        if nats > 0.0 and any(o is not c and o.accepted and (o.cue_nats or 0.0) > 0.0 for o in now.table):
-            nats = 0.0
-        if c.cue_nats is not None:
-            since_s = (c.stamp_ns - c.cue_ns) * 1e-9
-            nats = min(nats, c.cue_nats + self.settings.cues.recovery_nats_per_s * since_s)
-        c.cue_nats, c.cue_ns = nats, c.stamp_ns
-        ceiling = max(self._accept_nats - CUE_MARGIN_NATS - c.single_log_odds, 0.0)
-        if nats > max(of_proven, ceiling) and c.scan_passes >= CUE_PASSES:
-            c.proven_cues |= now.cues.proven(ObjectPath(c.path_ns, c.path_m, scatter_m(c.range_m)), now.trail)
-            of_proven = now.cues.nats(state, now.trail, c.stamp_ns, c.proven_cues).of_proven
-        nats = min(nats, max(of_proven, ceiling) if c.scan_passes >= CUE_PASSES else ceiling)
-        observed = min(c.single_log_odds, self._follow_up_nats)
-        # a wrong cue does not end the observation of the drone
-        c.single_log_odds = max(c.single_log_odds + nats, observed)
-        return f"; cues {nats:+.1f} ({remark})"
 
     def _count_pass_throughs(self, now: _State, part: Slice, now_ns: int) -> None:
         """Count the pulses that pass through a candidate's predicted position, scan pass by scan pass."""
@@ -482,8 +440,3 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
         now.start_ns, now.end_ns = end_ns + 1, None
         now.rejected.kinds.clear()
         now.finder.hidden.clear()
-
-
-def _object(c: Candidate) -> ObjectState:
-    """Position and velocity of a candidate."""
-    return ObjectState(c.stamp_ns, c.xyz_m, c.velocity_mps, c.p)

@@ -19,7 +19,7 @@ from links.dynamixel import Servo
 from links.lidar import Lidar
 from links.recording import RecordingReader
 from stages.detect import KernelDetect
-from stages.detect.kernel_candidates import inner_half_px, score_image
+from stages.detect.paper.kernel_candidates import inner_half_px, score_image
 from stages.geometry.frames import LidarMount
 from stages.kernels.detect.kernel_score import kernel_terms
 from stages.kernels.track.mean_shift import mean_shift

@@ -35,8 +35,8 @@ from links.simulated.rig.closed_loop import ClosedLoop
 from links.simulated.rig.run import Simulation
 from links.simulated.world.scene import Truth
 from stages.cues.evidence import CueWeights
+from stages.detect.candidate_cues import CUE_PASSES
 from stages.detect.candidate_messages import log_odds_of
-from stages.detect.evidence_detect import CUE_PASSES
 from stages.messages import CandidateEvidence, CandidateLog, CueState, Detections, DroneFix
 
 NEAR_M = 1.0  # as `grd evaluate`

@@ -1,6 +1,6 @@
 """Compiled functions that find minima of a score image and count the pixels around them.
 
-Source: see `stages/detect/kernel_candidates.py`.
+Source: see `stages/detect/paper/kernel_candidates.py`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Compiled functions that compute the paper's detector score, Equations (2) to (5), per pixel.
 
-Source: see `stages/detect/kernel_candidates.py`.
+Source: see `stages/detect/paper/kernel_candidates.py`.
 """
 
 from __future__ import annotations

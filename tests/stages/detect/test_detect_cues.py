@@ -90,10 +90,10 @@ def test_a_cue_that_matches_an_accepted_candidate_adds_nothing_to_another_one():
         c.scan_passes = 3
         now.table.put(c)
     stage.on_cue(gnss(0.2, PLACE_M))
-    stage._add_cues(now, other)
+    now.cues.add_to(other, now.trail, now.table)
     assert other.cue_nats == pytest.approx(2.0)
     drone.accepted, drone.cue_nats, other.cue_nats = True, 2.0, None
-    stage._add_cues(now, other)
+    now.cues.add_to(other, now.trail, now.table)
     assert other.cue_nats == 0.0
 
 
@@ -211,7 +211,7 @@ def test_a_jump_of_frame_map_removes_the_cues_of_the_old_one():
     stage.on_cue(gnss(0.2, PLACE_M))
     stage._now.odometry_jumped = True
     stage._prune(stage._now, c.stamp_ns)
-    stage._add_cues(stage._now, c)
+    stage._now.cues.add_to(c, stage._now.trail, stage._now.table)
     assert c.cue_nats is None
 
 

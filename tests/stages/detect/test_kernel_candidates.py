@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from stages.detect import kernel_candidates
-from stages.detect.kernel_candidates import Gates, Pixel, local_minima, reject_reason, score_image, width_px
+from stages.detect.paper import kernel_candidates
+from stages.detect.paper.kernel_candidates import Gates, Pixel, local_minima, reject_reason, score_image, width_px
 from stages.kernels.detect.kernel_candidates import middle_m, neighbour_pixels, own_pixels
 from stages.sweep.depth_image import focal_length_px
 from tests.stages.made import depth_image, point_of, street_depth

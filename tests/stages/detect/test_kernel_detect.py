@@ -8,8 +8,8 @@ from pydantic import ValidationError
 
 from flow.message import check_arrays
 from flow.stage import input_ports, output_ports
-from stages.detect.kernel_candidates import Gates
-from stages.detect.kernel_detect import KernelDetect
+from stages.detect.paper.kernel_candidates import Gates
+from stages.detect.paper.kernel_detect import KernelDetect
 from stages.messages import Detections, KernelScores, ScoreImage, SearchResult
 from tests.stages.made import depth_image, point_of, street_depth
 

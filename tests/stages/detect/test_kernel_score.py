@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stages.detect.kernel_candidates import inner_half_px, score_image
+from stages.detect.paper.kernel_candidates import inner_half_px, score_image
 from stages.kernels.detect.kernel_score import kernel_terms
 from stages.sweep.depth_image import focal_length_px
 from tests.stages.made import street_depth

@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from flow.message import check_arrays, hash_into
 from flow.stage import input_ports, output_ports
-from stages.detect.kernel_detect import KernelDetect
+from stages.detect.paper.kernel_detect import KernelDetect
 from stages.messages import DepthImage, Detections, DroneFix, SweptPoints, TrackingState, TrackState
 from stages.sweep.sweep import Sweep
 from stages.track.mean_shift_track import MeanShiftTrack

@@ -2,7 +2,7 @@
 
     t_hat_0 = unproject(argmin_c e(c))                                                      Equation (1)
 
-over all pixels with depth, e from `stages/detect/kernel_candidates.py`. The paper always reports a drone at that
+over all pixels with depth, e from `stages/detect/paper/kernel_candidates.py`. The paper always reports a drone at that
 pixel. Here the local minima are tested in ascending order of score, and each is accepted or rejected with a reason.
 `gates: null` is the paper's method: the pixel of lowest score is accepted.
 
@@ -19,7 +19,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from flow.stage import Settings, Stage
-from stages.detect.kernel_candidates import Gates, Pixel, inner_half_px, local_minima, reject_reason, score_image
+from stages.detect.paper.kernel_candidates import Gates, Pixel, inner_half_px, local_minima, reject_reason, score_image
 from stages.kernels.detect.kernel_score import kernel_terms
 from stages.messages import DepthImage, Detections, KernelScores, ScoreImage
 from stages.sweep.depth_image import unproject

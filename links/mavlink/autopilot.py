@@ -56,7 +56,7 @@ class AutopilotSettings(SourceSettings):
     sender: IPv4Address | None = None  # the autopilot's address, required when udpin listens beyond loopback
     profile: ProfileName = "ardupilot"
     send: tuple[PoseMessage, ...] = ("odometry",)  # messages per pose
-    yaw: YawOutput = "none"  # none: positions in the autopilot's axes; measured: poses in `map`, EK3_SRCn_YAW 6
+    yaw: YawOutput = "none"  # none: positions in the autopilot's axes; measured: poses with yaw, EK3_SRCn_YAW 6
     source_set: int = Field(2, ge=1, le=3)  # ArduPilot: EK3_SRCn_* that are grd's; set 1 flies without it
     switch_source: bool = False  # ArduPilot: request that set in flight, and set 1 when poses end (`source_switch.py`)
     on_rejection: OnRejection = "stop"  # when the autopilot's EKF rejects the pose: stop, reset or report

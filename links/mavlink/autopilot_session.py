@@ -146,9 +146,9 @@ class AutopilotSession:
             sent = [message for message in messages if self._send(message, pose)]
             if sent:
                 self.poses.on_sent(pose, now_ns, sent)
-                if any(message.get_type() in POSES for message in sent):
-                    turn_rad = self.poses.turn_rad(pose)
-                    self.switch.on_sent(pose, self.poses.axes_yaw_rad or 0.0, turn_rad, self.poses.autopilot, now_ns)
+                frame = self.poses.frame
+                if frame is not None and any(message.get_type() in POSES for message in sent):
+                    self.switch.on_sent(pose, frame, self.poses.turn_rad(pose), self.poses.autopilot, now_ns)
             self._send_texts(now_ns)
 
     def sent(self) -> list[Record]:
@@ -174,8 +174,12 @@ class AutopilotSession:
                 counts["source sets requested"] = self.switch.requests
             if self.switch.agreement.disagreements:
                 counts["pose and autopilot differ"] = self.switch.agreement.disagreements
-            if self.poses.axes_yaw_rad is not None:
-                counts["yaw in map of the sent axes [deg]"] = round(math.degrees(self.poses.axes_yaw_rad))
+            if self.poses.frame is not None:
+                counts["yaw in map of the sent axes [deg]"] = round(math.degrees(self.poses.frame.yaw_rad))
+                counts |= {
+                    f"map's origin in the sent axes, {axis} [cm]": round(100.0 * metres)
+                    for axis, metres in zip("xyz", self.poses.frame.offset_m.tolist(), strict=True)
+                }
             round_trip_ns = self._timesync.newest_ns
             intervals = self.intervals.counters
         totals = {

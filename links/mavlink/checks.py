@@ -1,4 +1,4 @@
-"""Preflight checks of the autopilot: heartbeat, losses, clock, rates, EKF status and parameters.
+"""Preflight checks of the autopilot: heartbeat, losses, clock, rates, EKF status, parameters and firmware.
 
 Source: https://mavlink.io/en/messages/common.html; parameters: `links.mavlink.profiles`; the limits are ours.
 """
@@ -17,7 +17,7 @@ from links.mavlink.autopilot import Autopilot
 from links.mavlink.frame_decoder import FOREIGN_TIMESYNC
 from links.mavlink.origin import OriginState
 from links.mavlink.parameters import ParameterValues, ask_parameters
-from links.mavlink.profiles import ARDUPILOT_STREAMS, ProfileName, RequiredParameter, findings
+from links.mavlink.profiles import ARDUPILOT_STREAMS, PROFILES, Profile, ProfileName, RequiredParameter, findings
 from links.mavlink.transport.framing import header, parse_frame
 from links.preflight.check_result import CheckResult, fail, ok, warning
 from links.preflight.link_checks import LinkChecks, declares
@@ -95,7 +95,7 @@ class AutopilotChecks(LinkChecks):
             if not observations.live:
                 yield warning(f"{source.name} parameters", "not in a recording: not checked")
             elif isinstance(source.link, Autopilot) and source.observation.records.count:
-                yield _parameters(source.name, source.link)
+                yield from _parameters(source.name, source.link)
 
 
 def autopilot_checks(
@@ -269,10 +269,12 @@ def _estimate(name: str, link: Autopilot, estimators: Sequence[AutopilotEstimato
         "compass": newest.compass_ratio,
     }
     rejected = [f"{what} ({ratio:.1f})" for what, ratio in ratios.items() if ratio > 1]
-    if not newest.attitude_good:
-        return fail(name, "its EKF has no attitude yet: keep it still and wait, then read its own messages")
     if rejected:
         return fail(name, f"its EKF rejects {', '.join(rejected)}: is another sensor wrong, such as compass or GPS?")
+    if not newest.attitude_good and link.settings.profile == "px4" and link.settings.yaw == "measured":
+        return warning(name, "its EKF has no yaw: normal without compass before poses are sent; keep it still and wait")
+    if not newest.attitude_good:
+        return fail(name, "its EKF has no attitude yet: keep it still and wait, then read its own messages")
     if newest.constant_position or not newest.position_good:
         return warning(name, "attitude good, no position: normal before poses are sent; check again when grd run sends")
     near = [f"{what} ({ratio:.1f})" for what, ratio in ratios.items() if ratio > WARN_RATIO]
@@ -281,11 +283,26 @@ def _estimate(name: str, link: Autopilot, estimators: Sequence[AutopilotEstimato
     return ok(name, "attitude and position good, all test ratios small")
 
 
-def _parameters(name: str, link: Autopilot) -> CheckResult:
+def _parameters(name: str, link: Autopilot) -> Iterator[CheckResult]:
     try:
-        return parameter_check(name, link.settings.required_parameters, ask_parameters(link))
+        received = ask_parameters(link)
     except LinkError as error:
-        return fail(f"{name} parameters", str(error))
+        yield fail(f"{name} parameters", str(error))
+        return
+    yield parameter_check(name, link.settings.required_parameters, received)
+    if received.frames:
+        yield version_check(name, PROFILES[link.settings.profile], received.version)
+
+
+def version_check(name: str, profile: Profile, version: tuple[int, int, int] | None) -> CheckResult:
+    """Whether grd supports the firmware."""
+    name, least = f"{name} firmware", ".".join(map(str, profile.least_version))
+    if version is None:
+        return warning(name, f"it did not answer a request of its version; {profile.name} {least} or later is needed")
+    text = f"{profile.name} {'.'.join(map(str, version))}"
+    if version[:2] < profile.least_version:
+        return fail(name, f"{text}: {least} or later is needed: {profile.least_version_why}")
+    return ok(name, text)
 
 
 def parameter_check(name: str, required: Sequence[RequiredParameter], received: ParameterValues) -> CheckResult:
@@ -298,4 +315,4 @@ def parameter_check(name: str, required: Sequence[RequiredParameter], received: 
     wrong = findings(required, received.values)
     if wrong:
         return fail(name, "; ".join(wrong))
-    return ok(name, f"all {len(required)} as required")
+    return ok(name, f"all {len({parameter.name for parameter in required})} as required")

@@ -1,6 +1,7 @@
-"""Read parameters of an autopilot over a separate connection, for preflight. No parameter is ever written.
+"""Read parameters and firmware version of an autopilot over a separate connection, for preflight. Nothing is written.
 
-Source: https://mavlink.io/en/services/parameter.html (PARAM_REQUEST_READ, bytewise and C-cast integers).
+Source: https://mavlink.io/en/services/parameter.html (PARAM_REQUEST_READ, bytewise and C-cast integers),
+https://mavlink.io/en/messages/common.html#AUTOPILOT_VERSION.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from typing import Any
 from flow.link import LinkError
 from links.clock import host_time
 from links.mavlink.autopilot import Autopilot
+from links.mavlink.commands import command_long
 from links.mavlink.profiles import PROFILES
 from links.mavlink.transport.connection import Connection, parse_connection
 from links.mavlink.transport.framing import V1, FrameSplitter, dialect, header, packed
@@ -21,6 +23,8 @@ from links.mavlink.transport.signing import Signer
 from links.mavlink.transport.stream_connection import open_connection
 
 RETRY_S = 0.3  # period of requests for missing parameters
+VERSION_WAIT_S = 1.5  # after the parameters; without an answer the version stays unknown
+REQUEST_MESSAGE, AUTOPILOT_VERSION = 512, 148
 BATCH = 8  # parameters per request burst, limited for slow lines
 V1_HEADER_BYTES, V2_HEADER_BYTES = 6, 10
 FORMATS = {1: "B", 2: "b", 3: "H", 4: "h", 5: "I", 6: "i", 9: "f"}  # MAV_PARAM_TYPE
@@ -33,6 +37,7 @@ class ParameterValues:
     values: dict[str, float] = field(default_factory=dict[str, float])
     missing: list[str] = field(default_factory=list[str])
     frames: int = 0  # frames of any kind from it; 0: it is not connected
+    version: tuple[int, int, int] | None = None  # of its firmware; None: it did not answer
 
 
 def ask_parameters(link: Autopilot, timeout_s: float = 5.0) -> ParameterValues:
@@ -47,7 +52,7 @@ def ask_parameters(link: Autopilot, timeout_s: float = 5.0) -> ParameterValues:
     try:
         return read_parameters(
             connection,
-            [required.name for required in link.settings.required_parameters],
+            list(dict.fromkeys(required.name for required in link.settings.required_parameters)),
             (link.settings.system_id, link.settings.component_id),
             link.settings.own_id,
             integers_bytewise=profile.integers_bytewise,
@@ -70,21 +75,30 @@ def read_parameters(
     timeout_s: float = 5.0,
     signer: Signer | None = None,
 ) -> ParameterValues:
-    """Request each parameter until it arrives or timeout_s has passed; the others are `missing`.
+    """Request each parameter until it arrives or timeout_s has passed, the others are `missing`; and the version.
 
     integers_bytewise: as PX4 sends them (`profiles.Profile.integers_bytewise`).
     """
     received, splitter = ParameterValues(), FrameSplitter()
     mav = dialect().MAVLink(None, srcSystem=own[0], srcComponent=own[1])
-    end_s, retry_s = time.monotonic() + timeout_s, 0.0
-    while (missing := [name for name in names if name not in received.values]) and time.monotonic() < end_s:
+    end_s, retry_s, version_retry_s = time.monotonic() + timeout_s, 0.0, 0.0
+    complete_s: float | None = None  # when all parameters had arrived
+    while time.monotonic() < end_s:
+        missing = [name for name in names if name not in received.values]
+        if not missing:
+            if received.version is not None:
+                break
+            end_s = min(end_s, (complete_s := complete_s or time.monotonic()) + VERSION_WAIT_S)
         if time.monotonic() >= retry_s:
             retry_s = time.monotonic() + RETRY_S
             heartbeat = dialect().MAVLink_heartbeat_message(18, 8, 0, 0, 3, 3)
-            requests = [
+            requests: list[Any] = [
                 dialect().MAVLink_param_request_read_message(*target, name.encode("ascii"), -1)
                 for name in missing[:BATCH]
             ]
+            if received.version is None and time.monotonic() >= version_retry_s:
+                version_retry_s = time.monotonic() + RETRY_S
+                requests.append(command_long(target, REQUEST_MESSAGE, AUTOPILOT_VERSION))
             for message in [heartbeat, *requests]:
                 if signer is not None:
                     signer.sign_for(mav, host_time.now_ns())
@@ -101,6 +115,9 @@ def read_parameters(
             if message.get_type() == "PARAM_VALUE" and message.param_id in missing:
                 received.values[message.param_id] = _value(frame, message, integers_bytewise)
                 retry_s = retry_s if set(missing[:BATCH]) - set(received.values) else 0.0
+            elif message.get_type() == "AUTOPILOT_VERSION":
+                number = int(message.flight_sw_version)  # major, minor, patch, type: a byte each; 0: not known
+                received.version = (number >> 24, number >> 16 & 255, number >> 8 & 255) if number else None
     received.missing = [name for name in names if name not in received.values]
     return received
 

@@ -2,13 +2,14 @@
 
 They depend on what the poses contain (`yaw` of the link):
 
-    none      positions in the autopilot's own axes: its yaw must come from its compass (or GPS), never from grd
+    none      positions in the autopilot's own axes: its yaw must come from its compass (or GPS), never from grd, and in
+              both source sets from the same one: another resets its yaw
     measured  poses in axes that are constant, parallel to the autopilot's when the first was sent: the yaw must come
               from grd alone; with the compass it would turn against the positions as the error of the compass changes
 
 grd is one source set of ArduPilot (`source_set`, EK3_SRC2_* by default); set 1 is the source that flies without grd.
 
-ArduPilot (4.5 to 4.6; EKF3)
+ArduPilot (4.6; EKF3)
 - ODOMETRY only in LOCAL_FRD / BODY_FRD, at 4 Hz or more; healthy for 300 ms after each message. At most one per 20 ms
   is fused (of two closer ones the second is dropped): 25 to 50 Hz is suitable.
 - EK3_SRC_OPTIONS bit 0, on by default, fuses the velocities of all source sets: one of an external pose in another
@@ -17,6 +18,11 @@ ArduPilot (4.5 to 4.6; EKF3)
   has moved: the check of visual odometry (ARMING_CHECK bit 18) must be off, and with it bit 0 (all checks).
 - It converts the covariance to cbrt(a^2 + b^2 + c^2) of the three variances, not to a sigma (0.1 m each gives 0.067 m,
   0.5 m gives 0.57 m), and never below VISO_POS_M_NSE and VISO_YAW_M_NSE.
+- With a GPS receiver it uses neither for the horizontal position, but the accuracy that GPS reports, at least
+  EK3_POSNE_M_NSE (0.5 m), also with the source set of grd, and up to 4.6 at least: where GPS is bad, poses of grd weigh
+  little. At 3 m the position follows them over 3.5 s, and an error of 1 m/s^2 of acceleration moves it by 12 m.
+- Aiding that begins with grd (set 1 without position) sets the height to grd's, even if it comes from the barometer.
+- Position times out 7 s after the last fused pose; the EKF failsafe lands 1 s later. Until then it says nothing.
 - time_usec is converted by the fastest message (JitterCorrection): a constant delay is not corrected. For grd it is
   only the transmission delay, because poses are predicted to the time of sending.
 - A change of reset_counter resets its position to the message's immediately.
@@ -31,12 +37,17 @@ PX4 (1.14 and later; EKF2)
 - time_usec is converted by its own TIMESYNC requests, which grd answers; until they have converged (500 requests) it
   uses the arrival time.
 - estimator_type must be VIO or VISION; LIDAR is rejected.
+- A pose with yaw in LOCAL_FRD leaves the yaw "not aligned" for the rest of the flight, so grd sends LOCAL_NED.
+- When GPS stops, the position is reset to grd's, and grd's offset to GPS is forgotten.
+- Its ESTIMATOR_STATUS has one test ratio of position, the larger one of GPS and grd.
 - HIGHRES_IMU lacks the biases that EKF2 estimates (`readers.py`): it is not independent of poses to that extent.
 
 Source: ArduPilot libraries/AP_VisualOdom/*.cpp, GCS_MAVLINK::handle_odometry, NavEKF3_core::writeExtNavData,
+NavEKF3_core::FuseVelPosNED (gpsPosAccuracy), setAidingMode, SelectMagFusion (yaw_source_reset),
 AP_NavEKF_Source::useVelXYSource, AP_Arming::visodom_checks,
 https://ardupilot.org/dev/docs/mavlink-nongps-position-estimation.html; PX4 mavlink_receiver.cpp
-(handle_message_odometry, _vision_position_estimate, _landing_target), EKF2 aid_sources/external_vision/*.cpp,
+(handle_message_odometry, _vision_position_estimate, _landing_target), EKF2 aid_sources/external_vision/*.cpp (yaw
+variance: max(variance, EKF2_EVA_NOISE), not squared), Ekf::get_innovation_test_status,
 https://docs.px4.io/main/en/ros/external_position_estimation.html
 """
 
@@ -63,6 +74,11 @@ class RequiredParameter:
     bits: int = 0  # all of these must be set
     bits_off: int = 0  # none of these may be set
     why: str = ""
+    when: tuple[str, float] | None = None  # required only while another parameter has this value
+
+    def applies(self, values: Mapping[str, float]) -> bool:
+        """Whether it is required, given the values of all parameters."""
+        return self.when is None or values.get(self.when[0]) == self.when[1]
 
     def fits(self, value: float) -> bool:
         """Whether a value is allowed, within the precision of 32 bits."""
@@ -108,6 +124,8 @@ class Profile:
     name: ProfileName
     unsupported: Mapping[str, str] = field(default_factory=dict[str, str])  # message -> why it is not sent
     integers_bytewise: bool = False  # PARAM_VALUE holds an integer's bytes, not its value
+    least_version: tuple[int, int] = (0, 0)
+    least_version_why: str = ""
 
 
 _ZERO_OFFSET = "grd sends the pose of the drone's body, not of a camera"
@@ -115,15 +133,21 @@ _DELAY = "transmission delay only: poses are predicted to the time of sending"
 EXTERNAL = 6.0  # ExternalNav, of an EK3_SRC parameter
 VISUAL_ODOMETRY_CHECK = 1 << 18  # of ARMING_CHECK
 
-_NO_ROTATION = "its angles cannot be left out, and PX4 takes them as north-aligned; send odometry"
-ARDUPILOT = Profile(name="ardupilot")
+_NO_ROTATION = "its angles cannot be left out, so it cannot be a position without yaw; send odometry"
+ARDUPILOT = Profile(
+    name="ardupilot",
+    least_version=(4, 6),
+    least_version_why="earlier ones reset the position to GPS while the source set of grd is used",
+)
 PX4 = Profile(
     name="px4",
     unsupported={
         "vision_position_estimate": _NO_ROTATION,
-        "landing_target": "PX4 accepts it only in its local NED frame, which grd does not know",
+        "landing_target": "PX4 accepts it only in its local NED frame, and grd has it in the body frame",
     },
     integers_bytewise=True,
+    least_version=(1, 14),
+    least_version_why="earlier ones have other parameters of external vision",
 )
 
 PROFILES: dict[ProfileName, Profile] = {"ardupilot": ARDUPILOT, "px4": PX4}
@@ -134,24 +158,39 @@ def required_parameters(profile: ProfileName, yaw: YawOutput, source_set: int = 
     return _ardupilot(yaw, source_set) if profile == "ardupilot" else _px4(yaw)
 
 
-def _ardupilot(yaw: YawOutput, source_set: int) -> tuple[RequiredParameter, ...]:
-    own = f"EK3_SRC{source_set}_"
+def _ardupilot_yaw(yaw: YawOutput, own: str) -> tuple[RequiredParameter, ...]:
+    """What depends on the yaw; `own`: prefix of grd's source set."""
     velocity = "grd sends no velocity"
-    measured = (
-        RequiredParameter(own + "VELXY", (0.0, 5.0), why=f"{velocity}; GPS velocity is in another frame"),
-        RequiredParameter(own + "VELZ", (0.0,), why=velocity),
+    if yaw == "measured":
+        return (
+            RequiredParameter(own + "VELXY", (0.0, 5.0), why=f"{velocity}; GPS velocity is in another frame"),
+            RequiredParameter(own + "VELZ", (0.0,), why=velocity),
+            RequiredParameter(
+                own + "YAW", (EXTERNAL,), why="yaw from grd: its frame is not north-aligned, a compass would rotate it"
+            ),
+            RequiredParameter("VISO_YAW_M_NSE", at_least=0.05, at_most=0.3, why="minimum yaw sigma"),
+        )
+    same_yaw = (
         RequiredParameter(
-            own + "YAW", (EXTERNAL,), why="yaw from grd: its frame is not north-aligned, a compass would rotate it"
-        ),
-        RequiredParameter("VISO_YAW_M_NSE", at_least=0.05, at_most=0.3, why="minimum yaw sigma"),
+            own + "YAW",
+            (source,),
+            when=("EK3_SRC1_YAW", source),
+            why="as EK3_SRC1_YAW: a change of the source resets the yaw, and grd then knows the axes no more",
+        )
+        for source in (1.0, 2.0, 3.0)
     )
-    without_yaw = (
+    return (
         RequiredParameter(own + "VELXY", (0.0, 3.0, 5.0), why=velocity),
         RequiredParameter(own + "VELZ", (0.0, 3.0), why=velocity),
         RequiredParameter(
             own + "YAW", (1.0, 2.0, 3.0), why="compass or GPS: grd sends no yaw, but positions in its axes"
         ),
+        *same_yaw,
     )
+
+
+def _ardupilot(yaw: YawOutput, source_set: int) -> tuple[RequiredParameter, ...]:
+    own = f"EK3_SRC{source_set}_"
     without_grd = "set 1 flies without grd"
     other = (
         RequiredParameter("EK3_SRC1_POSXY", (3.0, 0.0), why=f"{without_grd}: GPS, or none where there is no GPS"),
@@ -167,7 +206,13 @@ def _ardupilot(yaw: YawOutput, source_set: int) -> tuple[RequiredParameter, ...]
         RequiredParameter("VISO_TYPE", (1.0,), why="MAVLink; 3 (VOXL) would hide resets behind an offset"),
         RequiredParameter(own + "POSXY", (EXTERNAL,), why="horizontal position from grd"),
         RequiredParameter(own + "POSZ", (EXTERNAL, 1.0), why="height from grd, or the barometer"),
-        *(measured if yaw == "measured" else without_yaw),
+        RequiredParameter(
+            own + "POSZ",
+            (EXTERNAL,),
+            when=("EK3_SRC1_POSXY", 0.0),
+            why="without a position in set 1 the switch sets the height to grd's, and the barometer would pull it back",
+        ),
+        *_ardupilot_yaw(yaw, own),
         *(other if source_set != 1 else ()),
         RequiredParameter(
             "ARMING_CHECK",
@@ -195,11 +240,9 @@ def _px4(yaw: YawOutput) -> tuple[RequiredParameter, ...]:
             bits_off=4,
             why="1: horizontal position, 8: yaw; 2 (height) is optional, 4 (velocity) is not sent",
         ),
-        RequiredParameter(
-            "EKF2_GPS_CTRL", (0.0,), why="with GPS it rejects the yaw of a frame that is not north-aligned"
-        ),
+        RequiredParameter("EKF2_GPS_CTRL", (0.0,), why="the yaw of grd is not that of the true north, as GPS needs"),
         RequiredParameter("EKF2_MAG_TYPE", (5.0,), why="no compass: the yaw is from grd"),
-        RequiredParameter("EKF2_EVA_NOISE", at_least=0.01, at_most=0.2, why="minimum angle sigma"),
+        RequiredParameter("EKF2_EVA_NOISE", at_least=0.05, at_most=0.1, why="minimum variance of the yaw, unsquared"),
     )
     without_yaw = (
         RequiredParameter(
@@ -214,7 +257,9 @@ def _px4(yaw: YawOutput) -> tuple[RequiredParameter, ...]:
         *(measured if yaw == "measured" else without_yaw),
         RequiredParameter("EKF2_HGT_REF", (0.0, 3.0, 1.0), why="height from the barometer, grd or GPS"),
         RequiredParameter("EKF2_EV_NOISE_MD", (0.0,), why="use the message's covariance"),
-        RequiredParameter("EKF2_EV_DELAY", at_least=0.0, at_most=50.0, why=_DELAY),
+        RequiredParameter(
+            "EKF2_EV_DELAY", at_least=0.0, at_most=20.0, why="poses have the time of sending, by TIMESYNC on its clock"
+        ),
         RequiredParameter("EKF2_EVP_NOISE", at_least=0.01, at_most=0.3, why="minimum position sigma"),
         RequiredParameter("EKF2_EV_QMIN", at_least=0.0, at_most=50.0, why="quality is 1 at grd's limits, 100 at best"),
         RequiredParameter("EKF2_EV_POS_X", (0.0,), why=_ZERO_OFFSET),
@@ -223,13 +268,22 @@ def _px4(yaw: YawOutput) -> tuple[RequiredParameter, ...]:
     )
 
 
+def best_values(required: Sequence[RequiredParameter]) -> dict[str, float]:
+    """Values with which all fit."""
+    always = {parameter.name: parameter.best for parameter in required if parameter.when is None}
+    return always | {parameter.name: parameter.best for parameter in required if parameter.applies(always)}
+
+
 def findings(required: Sequence[RequiredParameter], values: Mapping[str, float]) -> list[str]:
     """One sentence per wrong or missing parameter; empty: all are correct."""
-    found: list[str] = []
-    for parameter in required:
+    found: dict[str, str] = {}
+    for parameter in (one for one in required if one.applies(values)):
         value = values.get(parameter.name)
         if value is None:
-            found.append(f"{parameter.name} was not received; it must be {parameter} ({parameter.why})")
+            text = f"{parameter.name} was not received; it must be {parameter} ({parameter.why})"
         elif not parameter.fits(value):
-            found.append(f"{parameter.name} is {value:g}, but must be {parameter} ({parameter.why})")
-    return found
+            text = f"{parameter.name} is {value:g}, but must be {parameter} ({parameter.why})"
+        else:
+            continue
+        found.setdefault(parameter.name, text)
+    return list(found.values())

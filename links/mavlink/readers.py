@@ -69,6 +69,12 @@ def _vector(frame: Any, *names: str, unit: float = 1.0) -> NDArray[np.float64]:
     return np.array([unit * x, -(unit * y), -(unit * z)])  # as `flip_yz`, but faster
 
 
+def _counts(frame: Any, *names: str) -> NDArray[np.float64]:
+    """Integers that were truncated towards zero, in grd's axes: n stands for n to n + 1, and 0 for -1 to 1."""
+    counts = _vector(frame, *names)
+    return counts + 0.5 * np.sign(counts)
+
+
 def _numbers(frame: Any, *names: str) -> list[float]:
     values = [float(getattr(frame, name)) for name in names]
     if not all(map(math.isfinite, values)):
@@ -95,32 +101,33 @@ def read_local_position(frame: Any, stamp_ns: int) -> DroneLocalPosition:
 
 
 def read_odometry(frame: Any, stamp_ns: int) -> DroneOdometry:
-    """ODOMETRY in a local frame with the velocity in the body frame; other frames raise ValueError."""
-    if frame.frame_id not in LOCAL_FRAMES or frame.child_frame_id != BODY_FRD:
+    """ODOMETRY in a local frame, with the velocity in the body frame or, of PX4, in the same; others: ValueError."""
+    if frame.frame_id not in LOCAL_FRAMES or frame.child_frame_id not in (BODY_FRD, frame.frame_id):
         raise ValueError("odometry in other frames")
     length = math.hypot(*frame.q)
     if not abs(length - 1.0) < 0.01:  # NaN compares false
         raise ValueError("invalid rotation")
     R_odom_drone = R_odom_drone_from_wxyz(frame.q)
+    velocity_mps, in_body = _vector(frame, "vx", "vy", "vz"), frame.child_frame_id == BODY_FRD
     return DroneOdometry(
         stamp_ns=stamp_ns,
         xyz_odom_m=_vector(frame, "x", "y", "z"),
         R_odom_drone=R_odom_drone,
-        velocity_drone_mps=_vector(frame, "vx", "vy", "vz"),
+        velocity_drone_mps=velocity_mps if in_body else R_odom_drone.T @ velocity_mps,
         angular_velocity_drone_radps=_vector(frame, "rollspeed", "pitchspeed", "yawspeed"),
         pose_covariance=pose_covariance_from_upper(frame.pose_covariance, R_odom_drone),
-        velocity_covariance=velocity_covariance_from_upper(frame.velocity_covariance),
+        velocity_covariance=velocity_covariance_from_upper(frame.velocity_covariance) if in_body else None,
         reset_counter=frame.reset_counter,
         quality_percent=None if frame.quality == 0 else max(frame.quality, 0),
     )
 
 
 def read_raw_imu(frame: Any, stamp_ns: int) -> DroneImu:
-    """RAW_IMU in ArduPilot's units, or SCALED_IMU: mg, mrad/s and mgauss."""
+    """RAW_IMU in ArduPilot's units, or SCALED_IMU: mg, mrad/s and mgauss, truncated (by PX4, too)."""
     return DroneImu(
         stamp_ns=stamp_ns,
-        acceleration_drone_mps2=_vector(frame, "xacc", "yacc", "zacc", unit=1e-3 * STANDARD_GRAVITY_MPS2),
-        angular_velocity_drone_radps=_vector(frame, "xgyro", "ygyro", "zgyro", unit=1e-3),
+        acceleration_drone_mps2=1e-3 * STANDARD_GRAVITY_MPS2 * _counts(frame, "xacc", "yacc", "zacc"),
+        angular_velocity_drone_radps=1e-3 * _counts(frame, "xgyro", "ygyro", "zgyro"),
         magnetic_field_drone_ut=_magnetic_field(frame),
     )
 

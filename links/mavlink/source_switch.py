@@ -2,11 +2,12 @@
 
 The switch to grd's set is requested (MAV_CMD_SET_EKF_SOURCE_SET) while all of this holds:
 
-    armed, in a mode without a target in global coordinates: the EKF's origin moves to grd's
+    armed, in a mode that holds or is flown by hand
     its parameters are as `profiles.py` requires; they are read once after each boot
     poses have been sent for MIN_SENDING_NS, and the newest contains a LiDAR position of the last second
     its EKF reports its state, and no test ratio of position or velocity above MAX_RATIO
-    the poses move as its own estimate does (`poses/agreement.py`), unless its EKF has no position to compare
+    the poses move as its own estimate does (`poses/agreement.py`), and are no more than FAR_M away from it, unless its
+        EKF has no position to compare
     it is slow enough for the angle between both axes, see below
 
 A request that is denied, or that is not acknowledged three times, is not repeated until the autopilot boots. Nor is any
@@ -35,9 +36,12 @@ import re
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
+
 from links.mavlink.commands import ACCEPTED, ACK_TIMEOUT_NS, IN_PROGRESS, TEMPORARILY_REJECTED, command_long, is_answer
 from links.mavlink.poses.agreement import MotionAgreement
 from links.mavlink.poses.autopilot_estimate import AutopilotEstimate
+from links.mavlink.poses.sent_frame import FAR_M, SentFrame
 from links.mavlink.profiles import EXTERNAL, RequiredParameter, findings
 from links.mavlink.readers import CONSTANT_POSITION, HORIZONTAL_RELATIVE
 from links.mavlink.transport.framing import dialect
@@ -48,11 +52,12 @@ FIRST_SET = 1  # flies without grd
 MODES = {0, 2, 4, 5, 16, 17}  # ArduCopter: Stabilize, AltHold, Guided, Loiter, PosHold, Brake
 ARMED = 128  # MAV_MODE_FLAG_SAFETY_ARMED
 MIN_SENDING_NS = 5_000_000_000  # ours: poses that are often interrupted cause no switch
-FALLBACK_AFTER_NS = 500_000_000  # without a pose; ArduPilot times out after 0.3 s, its EKF failsafe acts after 1 s
+FALLBACK_AFTER_NS = 500_000_000  # without a pose; ArduPilot's position times out after 7 s
 MAX_FIX_AGE_NS = 1_000_000_000  # age of the LiDAR position in a pose
 MAX_STATUS_AGE_NS = 2_000_000_000  # age of the EKF's status
 MAX_RATIO = 0.5  # test ratio; above 1 the EKF rejects
 MAX_TURNED_MPS = 1.0  # ours, chosen: error of the EKF's velocity after a change of axes
+HYSTERESIS_M = 2.0  # below FAR_M, from which a switch is requested again
 TRIES = 3
 PARAMETER_PERIOD_NS, PARAMETER_RETRY_PERIOD_NS = 200_000_000, 10_000_000_000  # of requests, and after TRIES of each
 USING = re.compile(r"Using EKF Source Set (\d)")
@@ -87,6 +92,7 @@ class SourceSwitch:
         self._status: tuple[int, Any] | None = None  # arrival and message
         self._position_ns = 0  # newest LOCAL_POSITION_NED
         self._speed_mps = 0.0  # of it, horizontal
+        self._step_m: float | None = None  # of the position at a switch, if it is too large
         self._turn_rad = math.pi  # of the axes of the poses against those of its own sources; at first unknown
         self._too_fast = False  # set 1 is due, see `_is_slow`
         self._blocked = ""  # why grd's set is not requested any more
@@ -106,6 +112,8 @@ class SourceSwitch:
             return f"source set {self._set} is not requested: {self._blocked}"
         read = not self._missing() or self._parameter_requests >= TRIES * len(self._required)
         wrong = findings(self._required, self._values) if read else []
+        if self._step_m is not None and self.active != self._set:
+            wrong.append(f"the position would move by {self._step_m:.0f} m; land and reboot the autopilot")
         return f"source set {self._set} is not requested: {wrong[0]}" if wrong else None
 
     def on_message(self, message: Any, arrival_ns: int) -> None:
@@ -129,14 +137,14 @@ class SourceSwitch:
     def on_sent(
         self,
         pose: RelativePose,
-        axes_yaw_rad: float,
+        frame: SentFrame,
         turn_rad: float | None,
         autopilot: AutopilotEstimate,
         now_ns: int,
     ) -> None:
-        """A pose was sent, in axes with this yaw in `map`; `autopilot`: its newest estimate.
+        """A pose was sent in a frame; `autopilot`: its newest estimate.
 
-        `turn_rad`: angle of those axes against the autopilot's own; None: not known.
+        `turn_rad`: angle of the frame's axes against the autopilot's own; None: not known.
         """
         if self._set is None:
             return
@@ -146,9 +154,19 @@ class SourceSwitch:
         self._sent, self._sent_ns, self._too_fast = pose, now_ns, False
         if self.active == FIRST_SET and turn_rad is not None:
             self._turn_rad = turn_rad
-        off_m = self.agreement.add(pose, axes_yaw_rad, autopilot)
+        off_m = self.agreement.add(pose, frame, autopilot)
         if off_m is not None and self.active != self._set:
             self._warn(f"pose and autopilot differ by {off_m:.1f} m")
+        own_m = None if autopilot.position is None else autopilot.position.at(pose.stamp_ns)
+        if own_m is None or pose.xyz_map_m is None:
+            self._step_m = None
+            return
+        step_m, limit_m = float(np.linalg.norm(frame.position(pose.xyz_map_m) - own_m)), FAR_M
+        if self._step_m is not None:
+            limit_m -= HYSTERESIS_M
+        elif step_m > limit_m and self.active != self._set:
+            self._warn(f"no source switch: it would be {step_m:.0f} m")
+        self._step_m = step_m if step_m > limit_m else None
 
     def due(self, now_ns: int) -> Any | None:
         """The message to send now, if one is due."""
@@ -185,7 +203,7 @@ class SourceSwitch:
             return False
         if pose.measured_ns is None or pose.stamp_ns - pose.measured_ns > MAX_FIX_AGE_NS:
             return False
-        if findings(self._required, self._values) or not self._is_slow():
+        if findings(self._required, self._values) or not self._is_slow() or self._step_m is not None:
             return False
         if self._status is None or now_ns - self._status[0] > MAX_STATUS_AGE_NS:
             return False
@@ -205,7 +223,8 @@ class SourceSwitch:
         return self._values.get("EK3_SRC1_POSXY", 0.0) not in (0.0, EXTERNAL)
 
     def _missing(self) -> list[str]:
-        return [parameter.name for parameter in self._required if parameter.name not in self._values]
+        names = dict.fromkeys(parameter.name for parameter in self._required)
+        return [name for name in names if name not in self._values]
 
     def _parameter_request(self, now_ns: int) -> Any | None:
         first = self._parameter_requests < TRIES * len(self._required)

@@ -61,6 +61,7 @@ class Estimator:
         self._memory = HeadingMemory(self.imu)
         self.earlier = EarlierFrame(errors.changed_frames)
         self.map_fixed = False  # `map` does not move with the vehicle
+        self.map_number = 0  # how often a map frame has begun
         self._queue = MeasurementQueue(self.imu, vehicle)
         self.resets, self.too_late = 0, 0
         self.fix_ns: int | None = None  # newest LiDAR position used
@@ -195,6 +196,7 @@ class Estimator:
 
         Everything in the one before is dropped, also what waits for its time.
         """
+        self.map_number += 1
         self.earlier.start_frame(turn_rad)
         self._forget_map()
         self._queue.clear()

@@ -215,7 +215,8 @@ class Fuse(Stage[FuseSettings]):
     def _status(self, state: PoseState, reason: str) -> Status:
         e = self._estimator
         measured_ns, resets = e.fix_ns or e.newest_fix_ns, e.resets + self._jumps.number
-        return Status(state, reason, measured_ns, self._track_id, resets, e.nis, e.measured_rotation_ns, e.odom_yaw)
+        rotation_ns, number = e.measured_rotation_ns, e.map_number
+        return Status(state, reason, measured_ns, self._track_id, resets, e.nis, rotation_ns, e.odom_yaw, number)
 
     def _known(self, now_ns: int) -> MapEstimate:
         """The estimate propagated to now, with the bias covariances added."""

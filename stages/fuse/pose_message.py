@@ -42,6 +42,7 @@ class Status:
     nis: float
     rotation_ns: int | None = None
     odom_yaw: OdomYaw | None = None
+    map_number: int = 0
 
 
 def lost(stamp_ns: int, status: Status) -> RelativePose:
@@ -99,6 +100,7 @@ def _message(
         rotation_ns=status.rotation_ns if isinstance(estimate, PoseEstimate) else None,
         odom_yaw_rad=None if yaw is None else yaw.yaw_rad,
         odom_yaw_sigma_rad=None if yaw is None else yaw.sigma_rad,
+        map_number=status.map_number,
     )
 
 

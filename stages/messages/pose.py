@@ -49,11 +49,11 @@ class PoseEstimate:
     velocity_covariance: Mat3  # of velocity_map_mps [m2/s2]
 
 
-@message(schema=80)
+@message(schema=120)
 class RelativePose(Message):
     """State and estimate of the drone relative to the vehicle and in `map`, predicted to stamp_ns.
 
-    `map`, the frame that the autopilot receives, does not move: it is the frame of the vehicle at its start.
+    `map` does not move: it is the frame of the vehicle at its start, or where its odometry has begun again.
     """
 
     state: PoseState
@@ -68,6 +68,7 @@ class RelativePose(Message):
     # independent of our poses, kept since. None: not known, or the drone may be another one
     odom_yaw_rad: float | None = None
     odom_yaw_sigma_rad: float | None = None  # when it was learnt
+    map_number: int = 0  # how often `map` has begun: one with another number may be another frame
 
     @property
     def xyz_vehicle_m(self) -> Vec3 | None:

@@ -22,6 +22,7 @@ from links.clock import host_time
 from links.mavlink import Autopilot
 from links.mavlink.poses.gate import PoseLimits, reject_reason
 from links.mavlink.poses.pose_messages import odometry
+from links.mavlink.poses.sent_frame import SentFrame
 from links.mavlink.transport.framing import FrameSplitter, packed
 
 sys.path.append(str(Path(__file__).parents[1] / "links" / "mavlink"))
@@ -37,12 +38,12 @@ def test_the_gate(benchmark: Any):
 
 def test_a_pose_to_a_frame(benchmark: Any):
     mav = mavlink.MAVLink(None, srcSystem=1, srcComponent=197)
-    benchmark(lambda: packed(odometry(good_pose(), 0.0, 0, LIMITS), mav))
+    benchmark(lambda: packed(odometry(good_pose(), SentFrame(0.0, np.zeros(3)), 0, LIMITS), mav))
 
 
 def test_pymavlink_packing_the_same_message(benchmark: Any):
     mav = mavlink.MAVLink(None, srcSystem=1, srcComponent=197)
-    message = odometry(good_pose(), 0.0, 0, LIMITS)
+    message = odometry(good_pose(), SentFrame(0.0, np.zeros(3)), 0, LIMITS)
     benchmark(lambda: packed(message, mav))
 
 

@@ -23,7 +23,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from links.mavlink.poses.autopilot_estimate import AutopilotEstimate
-from stages.geometry.frames import Array64, rotation_z
+from links.mavlink.poses.sent_frame import SentFrame
+from stages.geometry.frames import Array64
 from stages.messages import RelativePose
 
 AUTOPILOT_SIGMA_M = 0.5  # of the change of the autopilot's position error within REFERENCE_PERIOD_NS, by GPS
@@ -55,10 +56,10 @@ class MotionAgreement:
         """The autopilot has booted, or poses were not sent for a while."""
         self._reference = self._agreed_ns = None
 
-    def add(self, pose: RelativePose, axes_yaw_rad: float, autopilot: AutopilotEstimate) -> float | None:
+    def add(self, pose: RelativePose, frame: SentFrame, autopilot: AutopilotEstimate) -> float | None:
         """Add a pose that was sent, and the autopilot's newest estimate; returns the distance [m] when it disagrees.
 
-        `axes_yaw_rad`: yaw in `map` of the axes that it was sent in.
+        `frame`: that it was sent in; only its axes count.
         """
         xyz_odom_m = None if autopilot.position is None else autopilot.position.at(pose.stamp_ns)
         if pose.xyz_map_m is None or xyz_odom_m is None:
@@ -69,7 +70,7 @@ class MotionAgreement:
             self._start(pose, xyz_odom_m)
             return None
         moved_m = xyz_odom_m - first.xyz_odom_m
-        off_m = float(np.linalg.norm(rotation_z(-axes_yaw_rad) @ (pose.xyz_map_m - first.xyz_map_m) - moved_m))
+        off_m = float(np.linalg.norm(frame.R_sent_map @ (pose.xyz_map_m - first.xyz_map_m) - moved_m))
         if off_m > self.tolerance_m:
             self.disagreements += 1
             self._agreed_ns = None

@@ -50,12 +50,10 @@ class AutopilotPosition:
     xyz_odom_m: Array64
     velocity_odom_mps: Array64
 
-    def at(self, stamp_ns: int) -> Array64 | None:
-        """Position at a time; None: too old."""
+    def at(self, stamp_ns: int, max_age_ns: int = MAX_POSITION_AGE_NS) -> Array64 | None:
+        """Position (3,) at a time; None: too old."""
         since_ns = stamp_ns - self.arrival_ns
-        return (
-            None if abs(since_ns) > MAX_POSITION_AGE_NS else self.xyz_odom_m + 1e-9 * since_ns * self.velocity_odom_mps
-        )
+        return None if abs(since_ns) > max_age_ns else self.xyz_odom_m + 1e-9 * since_ns * self.velocity_odom_mps
 
 
 class EstimateEvent(enum.Enum):

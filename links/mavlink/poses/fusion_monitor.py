@@ -1,10 +1,13 @@
 """Whether the autopilot's EKF rejects the pose that it is sent, by its own status messages.
 
 EKF_STATUS_REPORT (ArduPilot) and ESTIMATOR_STATUS have the innovation test ratio of the horizontal position: above 1 it
-is rejected. Neither says which source is meant, so the ratio counts only while poses are sent. The stream is not useful
-then, and a reset to a pose that contradicts the autopilot's own sensors may be wrong. What follows is a setting:
+is rejected. Neither says which source is meant, so the ratio counts only while poses are sent, and one above 1 not
+while ESTIMATOR_STATUS reports a GPS glitch: it is the larger one of GPS and grd. PX4 may keep that flag after it has
+stopped GPS; a rejection is then not seen. The stream is not useful then, and a reset to a pose that contradicts the
+autopilot's own sensors may be wrong. What follows is a setting:
 
-    stop     no poses until the ratio was below RESUME_BELOW for RESUME_AFTER_NS (default)
+    stop     no poses until the ratio was below RESUME_BELOW, or NaN (nothing is fused), for RESUME_AFTER_NS (default).
+             ArduPilot repeats the last ratio while it fuses no position: only a change to set 1 ends it
     reset    the reset counter changes, so that the EKF takes the pose; after MAX_RESETS in a row as `stop`
     report   only a text and a counter
 
@@ -12,8 +15,9 @@ MAX_REJECTED_NS is shorter than the second after which the EKF failsafe acts. Ar
 the last fused pose: within RESUME_AFTER_NS it is known whether a position is accepted again; a reset that holds for
 RESETS_FORGOTTEN_NS was right.
 
-Source: ours; ArduPilot NavEKF3_core::send_status_report (square roots of ratios), ekf_check.cpp (FS_EKF_THRESH 0.8 for
-1 s), posRetryTimeNoVel_ms; https://mavlink.io/en/messages/common.html#ESTIMATOR_STATUS.
+Source: ours; ArduPilot NavEKF3_core::send_status_report (square roots of ratios), FuseVelPosNED (posTestRatio),
+ekf_check.cpp (FS_EKF_THRESH 0.8 for 1 s), posRetryTimeNoVel_ms; PX4 Ekf::get_innovation_test_status;
+https://mavlink.io/en/messages/common.html#ESTIMATOR_STATUS.
 """
 
 from __future__ import annotations
@@ -27,6 +31,8 @@ MAX_REJECTED_NS = 600_000_000  # ratio above 1 for so long, before ArduPilot's f
 RESUME_BELOW, RESUME_AFTER_NS = 0.5, 3_000_000_000  # half the innovation that the gate allows, as preflight warns of
 MAX_RESETS = 3
 RESETS_FORGOTTEN_NS = 5_000_000_000  # without rejection, after which resets are counted again from zero
+STATUSES = ("EKF_STATUS_REPORT", "ESTIMATOR_STATUS")
+GPS_GLITCH = 1024  # ESTIMATOR_GPS_GLITCH
 MAX_STATUS_GAP_NS = 2_000_000_000  # between two status messages: no statement in between
 
 
@@ -48,13 +54,15 @@ class FusionMonitor:
     def add(self, message: Any, sending: bool, now_ns: int) -> tuple[str, bool] | None:
         """Add a status message. (text, whether to change the reset counter) when a rejection begins."""
         ratio = _ratio(message)
-        if ratio is None:
+        if ratio is None or (math.isnan(ratio) and not self.stopped):
+            self._above_ns = None if message.get_type() in STATUSES else self._above_ns
             return None
         if self._newest_ns is None or now_ns - self._newest_ns > MAX_STATUS_GAP_NS:
             self._above_ns = self._below_ns = None
         self._newest_ns = now_ns
         self._above_ns = (self._above_ns or now_ns) if ratio > 1 and (sending or self.stopped) else None
-        self._below_ns = (self._below_ns or now_ns) if ratio < RESUME_BELOW else None
+        accepted = ratio < RESUME_BELOW or math.isnan(ratio)
+        self._below_ns = (self._below_ns or now_ns) if accepted else None
         if self.stopped and self._below_ns is not None and now_ns - self._below_ns >= RESUME_AFTER_NS:
             self.stopped = False
         if self.stopped or self._above_ns is None or now_ns - self._above_ns < MAX_REJECTED_NS:
@@ -78,12 +86,10 @@ class FusionMonitor:
 
 
 def _ratio(message: Any) -> float | None:
-    """Test ratio of the horizontal position, 1 at the gate; None: not such a message, or not known."""
+    """Test ratio of the horizontal position, 1 at the gate; NaN: nothing is fused; None: no such message, or of GPS."""
     kind = message.get_type()
     if kind == "EKF_STATUS_REPORT":
-        value = message.pos_horiz_variance
-    elif kind == "ESTIMATOR_STATUS":
-        value = message.pos_horiz_ratio
-    else:
-        return None
-    return float(value) if math.isfinite(value) and value >= 0 else None
+        return float(message.pos_horiz_variance)
+    if kind == "ESTIMATOR_STATUS" and not (message.flags & GPS_GLITCH and message.pos_horiz_ratio > 1):
+        return float(message.pos_horiz_ratio)
+    return None

@@ -1,14 +1,16 @@
 """MAVLink messages of a pose with rotation: ODOMETRY, VISION_POSITION_ESTIMATE and LANDING_TARGET.
 
-ODOMETRY and VISION_POSITION_ESTIMATE contain the drone's pose with the origin of `map`, which is static while the
-vehicle drives, as an EKF requires, in axes that point as the autopilot's own did when the first pose was sent:
+ODOMETRY and VISION_POSITION_ESTIMATE contain the drone's pose in a frame that is static while the vehicle drives, as an
+EKF requires, with the axes and the origin of the autopilot's own position when the first pose was sent (`SentFrame`).
+Its yaw in `map` is constant, so that its error turns the axes against north and adds no error to a pose in them. The
+axes stay parallel to those of the autopilot's position and velocity unless its EKF resets its yaw, so a switch between
+its own sources and grd turns its attitude by the error of its compass at most.
 
-    p_sent = Rz(axes_yaw)^T p_map,   R_sent_drone = Rz(axes_yaw)^T R_map_drone
+ArduPilot   LOCAL_FRD, the only frame that it accepts
+PX4         LOCAL_NED: in LOCAL_FRD it takes the yaw, but calls it unaligned for the rest of the flight, and turns a
+            position that it fuses without yaw. It needs `measured` without GPS and compass, so that no other yaw is
+            meant by north
 
-axes_yaw is constant, so that its error turns the axes against north and adds no error to a pose in them. The axes stay
-parallel to those of the autopilot's position and velocity unless its EKF resets its yaw, so a switch between its own
-sources and grd turns its attitude by the error of its compass at most. The frame is LOCAL_FRD, not LOCAL_NED: the yaw
-is not relative to the true north.
 Positions without yaw: `position_messages.py`. LANDING_TARGET contains the vehicle's position in the drone's body frame.
 
     p_drone_vehicle = -R_vehicle_drone^T t_vehicle_drone
@@ -35,11 +37,13 @@ from links.mavlink.ned_frd import (
     wxyz_from_R_odom_drone,
 )
 from links.mavlink.poses.gate import PoseLimits, worst_sigmas
+from links.mavlink.poses.sent_frame import SentFrame
+from links.mavlink.profiles import ProfileName
 from links.mavlink.transport.framing import SEQUENCE, dialect
-from stages.geometry.frames import Array64, rotation_z
 from stages.messages import PoseEstimate, RelativePose
 
-LOCAL_FRD, BODY_FRD = 20, 12  # MAV_FRAME: the only ones that ArduPilot accepts in ODOMETRY
+LOCAL_NED, LOCAL_FRD, BODY_FRD = 1, 20, 12  # MAV_FRAME
+ODOMETRY_FRAME: dict[ProfileName, int] = {"ardupilot": LOCAL_FRD, "px4": LOCAL_NED}
 VIO = 3  # MAV_ESTIMATOR_TYPE_VIO: accepted by PX4, unlike LIDAR
 VISION_OTHER = 3  # LANDING_TARGET_TYPE
 UNKNOWN, UNKNOWN_COVARIANCE = [math.nan] * 3, [math.nan] * 21
@@ -54,15 +58,17 @@ def quality_percent(pose: PoseEstimate, limits: PoseLimits) -> int:
     return max(1, min(100, round(100 * (1 - worst))))
 
 
-def odometry(pose: RelativePose, axes_yaw_rad: float, reset_counter: int, limits: PoseLimits) -> Any:
-    """ODOMETRY of a pose that the gate has accepted; `axes_yaw_rad`: yaw in `map` of the axes that it is sent in."""
+def odometry(
+    pose: RelativePose, frame: SentFrame, reset_counter: int, limits: PoseLimits, profile: ProfileName = "ardupilot"
+) -> Any:
+    """ODOMETRY of a pose that the gate has accepted."""
     estimate = _estimate(pose)
-    xyz_m, R = _in_axes(estimate, axes_yaw_rad)
+    R = frame.R_sent_map @ estimate.R_map_drone
     return dialect().MAVLink_odometry_message(
         pose.stamp_ns // 1000,
-        LOCAL_FRD,
+        ODOMETRY_FRAME[profile],
         BODY_FRD,
-        *flip_yz(xyz_m),
+        *flip_yz(frame.position(estimate.xyz_map_m)),
         wxyz_from_R_odom_drone(R),
         *UNKNOWN,  # velocity
         *UNKNOWN,  # angular velocity: the autopilot's gyros are better
@@ -74,13 +80,13 @@ def odometry(pose: RelativePose, axes_yaw_rad: float, reset_counter: int, limits
     )
 
 
-def vision_position_estimate(pose: RelativePose, axes_yaw_rad: float, reset_counter: int) -> Any:
-    """VISION_POSITION_ESTIMATE of a pose that the gate has accepted; for ArduPilot only, PX4 assumes true north."""
+def vision_position_estimate(pose: RelativePose, frame: SentFrame, reset_counter: int) -> Any:
+    """VISION_POSITION_ESTIMATE of a pose that the gate has accepted; for ArduPilot only."""
     estimate = _estimate(pose)
-    xyz_m, R = _in_axes(estimate, axes_yaw_rad)
+    R = frame.R_sent_map @ estimate.R_map_drone
     return dialect().MAVLink_vision_position_estimate_message(
         pose.stamp_ns // 1000,
-        *flip_yz(xyz_m),
+        *flip_yz(frame.position(estimate.xyz_map_m)),
         *rpy_from_R_odom_drone(R),
         upper_from_pose_covariance(estimate.map_covariance, R),
         reset_counter % SEQUENCE,
@@ -112,12 +118,6 @@ def landing_target(pose: RelativePose) -> Any:
         VISION_OTHER,
         1,
     )
-
-
-def _in_axes(estimate: PoseEstimate, axes_yaw_rad: float) -> tuple[Array64, Array64]:
-    """Position (3,) and rotation (3, 3) of the drone in axes with this yaw in `map`."""
-    R_axes_map = rotation_z(-axes_yaw_rad)
-    return R_axes_map @ estimate.xyz_map_m, R_axes_map @ estimate.R_map_drone
 
 
 def _estimate(pose: RelativePose) -> PoseEstimate:

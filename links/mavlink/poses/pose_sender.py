@@ -5,12 +5,16 @@
     none      a position in the autopilot's own axes; its yaw comes from its compass. It needs no rotation of the drone
     measured  a pose with yaw, while cameras or the raw IMU measure it; its yaw comes from grd alone. The axes are
               parallel to the autopilot's own when the first pose since its boot is sent, by its motion if that shows
-              them to 2 deg, else by its attitude; without an attitude they are those of `map`. They are kept.
+              them to 2 deg, else by its attitude; without an attitude they are those of `map`. They are kept while
+              `map` is the same
               After a restart in flight the attitude contains earlier poses: it chooses the axes, and measures nothing
 
-The reset counter is incremented with every jump of the pose, every change of the drone, and after every pause that the
-autopilot noticed, so that it resets to the new pose instead of gating it. Its initial value is arbitrary: after a
-restart of grd it should differ from the previous one.
+Both are in the frame of the autopilot's own position at the first pose (`SentFrame`). After a restart in flight that
+position has drifted meanwhile, and the frame begins there.
+
+The reset counter is incremented with every jump of the pose or of its frame, every change of the drone, and after every
+pause that the autopilot noticed, so that it resets to the new pose instead of gating it. Its initial value is
+arbitrary: after a restart of grd it should differ from the previous one.
 
 Texts: `status_texts.py`. Rejection of the pose by the autopilot: `fusion_monitor.py`.
 
@@ -26,6 +30,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+import numpy as np
+
 from links.mavlink.poses.autopilot_estimate import MAX_ATTITUDE_AGE_NS, AutopilotEstimate
 from links.mavlink.poses.fusion_monitor import FusionMonitor, OnRejection
 from links.mavlink.poses.gate import PoseLimits, RejectReason, reject_reason
@@ -33,15 +39,18 @@ from links.mavlink.poses.odom_frame import odom_yaw_rad
 from links.mavlink.poses.pose_messages import landing_target, odometry, vision_position_estimate
 from links.mavlink.poses.position_gate import gate_reason
 from links.mavlink.poses.position_messages import position_odometry, position_vision_estimate
+from links.mavlink.poses.sent_frame import ECHO_M, FAR_M, TURNED_RAD, SentFrame
 from links.mavlink.poses.status_texts import StatusTexts
 from links.mavlink.profiles import ProfileName, YawOutput
 from links.mavlink.transport.framing import SEQUENCE
+from stages.geometry.frames import Array64
 from stages.heading.odometry_heading import SHARP_RAD, WRONG_COMPASS_RAD
 from stages.messages import PoseState, RelativePose
 
 PoseMessage = Literal["odometry", "vision_position_estimate", "landing_target"]
 
 POSE_TIMEOUT_NS = 300_000_000  # the autopilot's timeout for poses
+FIRST_POSITION_AGE_NS = 1_000_000_000  # of the autopilot's position against the first pose: it comes at 4 Hz or more
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,8 +77,9 @@ class PoseSender:
         on_rejection: OnRejection = "stop",
     ) -> None:
         self.rejected: Counter[RejectReason] = Counter()
-        self.axes_yaw_rad: float | None = None
-        """Yaw in `map` of the axes that poses are sent in [rad]; None: none was sent since the autopilot's boot."""
+        self.frame: SentFrame | None = None
+        """Frame that poses are sent in; None: none was sent since the autopilot's boot."""
+        self._next_frame: SentFrame | None = None  # of the newest messages; `frame` once they were sent
         self.reset_counter = reset_counter % SEQUENCE
         self._kinds: tuple[PoseMessage, ...] = tuple(kinds)
         self._limits = limits
@@ -103,7 +113,7 @@ class PoseSender:
     def turn_rad(self, pose: RelativePose) -> float | None:
         """Angle of the axes of a sent pose against the autopilot's own [rad]; None: not known."""
         own_yaw_rad = self._odom_axes_yaw_rad(self.with_axes(pose))
-        return None if own_yaw_rad is None else (self.axes_yaw_rad or 0.0) - own_yaw_rad
+        return None if own_yaw_rad is None else (0.0 if self.frame is None else self.frame.yaw_rad) - own_yaw_rad
 
     def with_axes(self, pose: RelativePose) -> RelativePose:
         """A pose with the axes of the first one that was sent, until the estimate jumps: positions must not turn."""
@@ -128,8 +138,9 @@ class PoseSender:
             if reason is not None and reason is not RejectReason.NOT_NEWER:  # a newer one was sent
                 self._stop(reason.value)
         else:
-            self._update_reset_counter(pose, now_ns)
-            self._update_axes(pose)
+            if self._has_jumped(pose, now_ns):
+                self._increment_reset_counter()
+            self._next_frame = self._frame_of(pose)
         return [self._message(kind, pose) for kind in sendable]
 
     def on_yaw_reset(self) -> None:
@@ -139,7 +150,7 @@ class PoseSender:
     def on_boot(self) -> None:
         """The autopilot has booted: its axes are others, and their yaw has to be learnt again before a pose is sent."""
         self._poses_sent = self._yaw_reset = False
-        self._other_boot_rad, self.axes_yaw_rad, self._axes_pose = self._odom_yaw_rad, None, None
+        self._other_boot_rad, self.frame, self._axes_pose = self._odom_yaw_rad, None, None
         self.fusion.on_boot()
 
     def on_estimator_status(self, message: Any, now_ns: int) -> None:
@@ -159,7 +170,7 @@ class PoseSender:
         if not self.sends_yaw and (self._axes_pose is None or _estimate_of(pose) != _estimate_of(self._axes_pose)):
             self._axes_pose = pose
         self._sent = SentPose(now_ns, pose.stamp_ns, pose.resets, pose.track_id)
-        self._incremented, self._poses_sent = False, True
+        self._incremented, self._poses_sent, self.frame = False, True, self._next_frame
         if not self._sending:
             self._sending = True
             self.texts.on_sending(now_ns)
@@ -175,17 +186,48 @@ class PoseSender:
             self._sending = False
             self.texts.on_stopped(reason)
 
-    def _update_reset_counter(self, pose: RelativePose, now_ns: int) -> None:
+    def _has_jumped(self, pose: RelativePose, now_ns: int) -> bool:
+        """Whether the autopilot must not expect a pose near the one that was sent last."""
         last = self._sent
-        if last is None or self._incremented:
-            return
-        if now_ns - last.at_ns > POSE_TIMEOUT_NS or pose.resets != last.resets or pose.track_id != last.track_id:
+        if last is None:
+            return False
+        return now_ns - last.at_ns > POSE_TIMEOUT_NS or _estimate_of(pose) != (last.resets, last.track_id)
+
+    def _increment_reset_counter(self) -> None:
+        """Increment it with a change, once until a pose is sent."""
+        if not self._incremented:
             self.reset_counter = (self.reset_counter + 1) % SEQUENCE
             self._incremented = True
 
-    def _update_axes(self, pose: RelativePose) -> None:
-        if not self.sends_yaw or self.axes_yaw_rad is None:
-            self.axes_yaw_rad = self._odom_axes_yaw_rad(pose) or 0.0
+    def _frame_of(self, pose: RelativePose) -> SentFrame:
+        """The frame of a pose that the gate has accepted (`SentFrame`)."""
+        frame, position, xyz_map_m = self.frame, self.autopilot.position, pose.xyz_map_m
+        assert xyz_map_m is not None
+        own_m = None if position is None else position.at(pose.stamp_ns, FIRST_POSITION_AGE_NS)
+        own_yaw_rad, number = self._odom_axes_yaw_rad(pose), pose.map_number
+        if frame is not None and number != frame.map_number and own_m is not None and own_yaw_rad is not None:
+            frame = None if self._is_other(frame, xyz_map_m, own_m, own_yaw_rad) else replace(frame, map_number=number)
+        yaw_rad = frame.yaw_rad if frame is not None and self.sends_yaw else own_yaw_rad or 0.0
+        if frame is None:
+            if self.frame is not None:
+                self._increment_reset_counter()
+            if own_m is None:
+                return SentFrame(yaw_rad, np.zeros(3), anchored=False, map_number=number)
+            return replace(SentFrame.through(yaw_rad, xyz_map_m, own_m), map_number=number)
+        sent_m, anchored = frame.position(xyz_map_m), frame.anchored or own_m is not None
+        if own_m is not None and not frame.anchored and np.linalg.norm(sent_m - own_m) > ECHO_M:
+            self._increment_reset_counter()
+            sent_m = own_m
+        elif yaw_rad == frame.yaw_rad:
+            return replace(frame, anchored=anchored)
+        through = SentFrame.through(yaw_rad, xyz_map_m, sent_m)
+        return replace(through, anchored=anchored, map_number=frame.map_number)
+
+    def _is_other(self, frame: SentFrame, xyz_map_m: Array64, own_m: Array64, own_yaw_rad: float) -> bool:
+        """Whether `map` is another one than that of the frame, by the autopilot's own position (3,) and axes."""
+        if self.sends_yaw and abs(math.remainder(frame.yaw_rad - own_yaw_rad, math.tau)) > TURNED_RAD:
+            return True
+        return float(np.linalg.norm(frame.position(xyz_map_m) - own_m)) > FAR_M
 
     def _odom_axes_yaw_rad(self, pose: RelativePose) -> float | None:
         """Yaw of the autopilot's own axes in `map`: as learnt, with yaw if that is sharp, else by its attitude."""
@@ -228,20 +270,22 @@ class PoseSender:
         return None
 
     def _message(self, kind: PoseMessage, pose: RelativePose) -> Any:
-        if kind != "landing_target" and self._yaw == "none":
-            return self._position_message(kind, pose)
+        if kind == "landing_target":
+            return landing_target(pose)
+        frame = self._next_frame
+        assert frame is not None
+        if self._yaw == "none":
+            return self._position_message(kind, pose, frame)
         if kind == "odometry":
-            return odometry(pose, self.axes_yaw_rad or 0.0, self.reset_counter, self._limits)
-        if kind == "vision_position_estimate":
-            return vision_position_estimate(pose, self.axes_yaw_rad or 0.0, self.reset_counter)
-        return landing_target(pose)
+            return odometry(pose, frame, self.reset_counter, self._limits, self._profile)
+        return vision_position_estimate(pose, frame, self.reset_counter)
 
-    def _position_message(self, kind: PoseMessage, pose: RelativePose) -> Any:
+    def _position_message(self, kind: PoseMessage, pose: RelativePose, frame: SentFrame) -> Any:
         attitude = self.autopilot.attitude if self._profile == "ardupilot" else None
         if kind == "odometry":
-            return position_odometry(pose, self.reset_counter, self._limits, attitude)
+            return position_odometry(pose, frame, self.reset_counter, self._limits, attitude)
         assert attitude is not None  # PX4 has no VISION_POSITION_ESTIMATE
-        return position_vision_estimate(pose, self.reset_counter, attitude)
+        return position_vision_estimate(pose, frame, self.reset_counter, attitude)
 
 
 def _estimate_of(pose: RelativePose) -> tuple[int, int]:

@@ -1,10 +1,8 @@
-"""Gate and axes of positions without yaw.
+"""Gate and covariance of positions without yaw.
 
 An autopilot that keeps its own yaw takes a position in its own axes, x towards its north. grd knows them relative to
 `map` from the time when the autopilot's telemetry was independent (`RelativePose.odom_yaw_rad`); afterwards the yaw is
-not measured, and stays the same:
-
-    p_odom = Rz(odom_yaw)^T p_map
+not measured, and stays the same until the pose jumps (`SentFrame`).
 
 An error of that yaw, e, turns every acceleration against the one that the autopilot measures. Its EKF forgets over
 about a second, so its position is off by about e times the way that the drone is accelerated in that time (LEVER_M).
@@ -17,14 +15,14 @@ Source: ours; ArduPilot NavEKF3 and PX4 EKF2 with position noise of 0.2 m and ac
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from links.mavlink.poses.gate import PoseLimits, RejectReason, age_reason, reject_reason, yaw_reason
+from links.mavlink.poses.sent_frame import SentFrame
 from links.mavlink.profiles import YawOutput
-from stages.geometry.frames import rotation_z
 from stages.messages import PoseEstimate, PoseState, RelativePose
 
 LEVER_M = 2.0  # displacement by 4 m/s^2 within a second
@@ -32,13 +30,11 @@ COMPASS_RAD = math.radians(3.0)  # variation of an autopilot's compass error in 
 SYMMETRIC = 1e-6  # relative
 
 
-@dataclass(frozen=True, slots=True)
-class OdomPosition:
-    """A position in the autopilot's axes (x north by its yaw, y west, z up)."""
+class SentPosition(NamedTuple):
+    """A position in the frame that it is sent in."""
 
-    xyz_odom_m: NDArray[np.float64]  # (3,)
+    xyz_m: NDArray[np.float64]  # (3,)
     covariance_m2: NDArray[np.float64]  # (3, 3), with the error of the yaw
-    R_odom_map: NDArray[np.float64]  # (3, 3)
 
 
 def position_reason(pose: RelativePose, now_ns: int, limits: PoseLimits) -> RejectReason | None:
@@ -74,14 +70,14 @@ def gate_reason(pose: RelativePose, now_ns: int, limits: PoseLimits, yaw: YawOut
     return reject_reason(pose, now_ns, limits) or yaw_reason(pose, limits)
 
 
-def odom_position(pose: RelativePose) -> OdomPosition:
-    """The position in the autopilot's axes. Raises ValueError for a pose that the gate must reject."""
-    if pose.estimate is None or pose.odom_yaw_rad is None or pose.odom_yaw_sigma_rad is None:
+def sent_position(pose: RelativePose, frame: SentFrame) -> SentPosition:
+    """The position in a frame with the autopilot's axes. Raises ValueError for a pose that the gate must reject."""
+    if pose.estimate is None or pose.odom_yaw_sigma_rad is None:
         raise ValueError("no position in the autopilot's axes: the gate must reject it")
-    R_odom_map = rotation_z(-pose.odom_yaw_rad)
+    R = frame.R_sent_map
     level_m2 = (pose.odom_yaw_sigma_rad**2 + COMPASS_RAD**2) * LEVER_M**2
-    covariance = R_odom_map @ _covariance_map_m2(pose) @ R_odom_map.T + np.diag([level_m2, level_m2, 0.0])
-    return OdomPosition(R_odom_map @ pose.estimate.xyz_map_m, covariance, R_odom_map)
+    covariance = R @ _covariance_map_m2(pose) @ R.T + np.diag([level_m2, level_m2, 0.0])
+    return SentPosition(frame.position(pose.estimate.xyz_map_m), covariance)
 
 
 def position_quality_percent(pose: RelativePose, limits: PoseLimits) -> int:

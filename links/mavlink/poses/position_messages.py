@@ -21,26 +21,26 @@ import numpy as np
 from links.mavlink.ned_frd import R_odom_drone_from_rpy, flip_yz, upper_from_pose_covariance, wxyz_from_R_odom_drone
 from links.mavlink.poses.autopilot_estimate import AutopilotAttitude
 from links.mavlink.poses.gate import PoseLimits
-from links.mavlink.poses.pose_messages import BODY_FRD, LOCAL_FRD, UNKNOWN, UNKNOWN_COVARIANCE, VIO
-from links.mavlink.poses.position_gate import odom_position, position_quality_percent
+from links.mavlink.poses.pose_messages import BODY_FRD, LOCAL_FRD, LOCAL_NED, UNKNOWN, UNKNOWN_COVARIANCE, VIO
+from links.mavlink.poses.position_gate import position_quality_percent, sent_position
+from links.mavlink.poses.sent_frame import SentFrame
 from links.mavlink.transport.framing import SEQUENCE, dialect
 from stages.messages import RelativePose
 
-LOCAL_NED = 1  # MAV_FRAME
 TILT_RAD2 = math.radians(2.0) ** 2  # of the autopilot's own roll and pitch
 NO_YAW_RAD2 = math.pi**2  # of a yaw that is not measured
 
 
 def position_odometry(
-    pose: RelativePose, reset_counter: int, limits: PoseLimits, attitude: AutopilotAttitude | None
+    pose: RelativePose, frame: SentFrame, reset_counter: int, limits: PoseLimits, attitude: AutopilotAttitude | None
 ) -> Any:
     """ODOMETRY of a position that the gate has accepted. `attitude` None: for PX4."""
-    position = odom_position(pose)
+    position = sent_position(pose, frame)
     return dialect().MAVLink_odometry_message(
         pose.stamp_ns // 1000,
         LOCAL_NED if attitude is None else LOCAL_FRD,
         BODY_FRD,
-        *flip_yz(position.xyz_odom_m),
+        *flip_yz(position.xyz_m),
         [math.nan] * 4 if attitude is None else wxyz_from_R_odom_drone(R_odom_drone_from_rpy(*_angles(attitude))),
         *UNKNOWN,
         *UNKNOWN,
@@ -52,12 +52,14 @@ def position_odometry(
     )
 
 
-def position_vision_estimate(pose: RelativePose, reset_counter: int, attitude: AutopilotAttitude) -> Any:
+def position_vision_estimate(
+    pose: RelativePose, frame: SentFrame, reset_counter: int, attitude: AutopilotAttitude
+) -> Any:
     """VISION_POSITION_ESTIMATE of an accepted position, for ArduPilot."""
-    position = odom_position(pose)
+    position = sent_position(pose, frame)
     return dialect().MAVLink_vision_position_estimate_message(
         pose.stamp_ns // 1000,
-        *flip_yz(position.xyz_odom_m),
+        *flip_yz(position.xyz_m),
         *_angles(attitude),
         _upper(position.covariance_m2, TILT_RAD2, NO_YAW_RAD2),
         reset_counter % SEQUENCE,

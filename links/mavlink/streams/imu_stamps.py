@@ -9,8 +9,8 @@ integration interval of 2.5 to 5 ms, 2 ms old.
 Older versions of ArduPilot take RAW_IMU's time from a 32-bit counter of microseconds, which starts again after
 71.6 min.
 
-ArduPilot's SCALED_IMU has the values of RAW_IMU: two messages of the same samples would be one stream with wrong times.
-Only one is used, RAW_IMU or HIGHRES_IMU if it arrives.
+ArduPilot's SCALED_IMU and HIGHRES_IMU (since 4.6) have the values of RAW_IMU: messages of the same samples would be one
+stream with wrong times. Only the first of PREFERENCE that arrives is used.
 
 Source: https://mavlink.io/en/messages/common.html#RAW_IMU; ArduPilot GCS_MAVLINK::send_raw_imu (GCS_Common.cpp) and
 AP_InertialSensor.cpp (DEFAULT_ACCEL_FILTER, DEFAULT_GYRO_FILTER), https://github.com/ArduPilot/ardupilot; PX4
@@ -22,8 +22,8 @@ from __future__ import annotations
 DELAY_NS: dict[str, int] = {"RAW_IMU": 12_500_000, "SCALED_IMU": 12_500_000, "HIGHRES_IMU": 2_000_000}
 """Age of the values of an IMU message at its stamp."""
 
-PREFERRED = ("RAW_IMU", "HIGHRES_IMU")
-PREFERENCE_TIMEOUT_NS = 2_000_000_000  # so long after one of them SCALED_IMU is not used
+PREFERENCE = ("RAW_IMU", "HIGHRES_IMU", "SCALED_IMU")
+PREFERENCE_TIMEOUT_NS = 2_000_000_000  # so long after one of them those behind it are not used
 COUNTER_US = 2**32
 
 
@@ -31,15 +31,15 @@ class ImuSelection:
     """Which IMU message of an autopilot is used."""
 
     def __init__(self) -> None:
-        self._preferred_ns: int | None = None  # arrival of the newest preferred message
+        self._newest_ns: dict[str, int] = {}  # arrival of the newest one of each kind
 
     def accepts(self, kind: str, arrival_ns: int) -> bool:
         """Whether a message is used: always, unless it is an IMU message while a preferred one arrives."""
-        if kind in PREFERRED:
-            self._preferred_ns = arrival_ns
-        elif kind == "SCALED_IMU":
-            return self._preferred_ns is None or arrival_ns - self._preferred_ns > PREFERENCE_TIMEOUT_NS
-        return True
+        if kind not in PREFERENCE:
+            return True
+        self._newest_ns[kind] = arrival_ns
+        before = (self._newest_ns.get(other) for other in PREFERENCE[: PREFERENCE.index(kind)])
+        return all(ns is None or arrival_ns - ns > PREFERENCE_TIMEOUT_NS for ns in before)
 
 
 def time_since_boot_us(kind: str, time_usec: int, expected_us: int | None) -> int:

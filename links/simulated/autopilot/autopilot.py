@@ -229,7 +229,7 @@ class Autopilot:
         rate = rate + gyro_bias + self._rng.normal(0.0, np.radians(s.gyro_noise_degps), rate.shape)
         force = force + force_bias + self._rng.normal(0.0, s.accelerometer_noise_mps2, force.shape)
         counts = np.hstack([flip_yz(force) / STANDARD_GRAVITY_MPS2, flip_yz(rate)]) * 1e3  # mg, mrad/s
-        counts = np.clip(np.rint(counts), -INT16, INT16).astype(int).tolist()
+        counts = np.clip(np.trunc(counts), -INT16, INT16).astype(int).tolist()
         return [
             mavlink.MAVLink_raw_imu_message(ns // 1_000, *six, 0, 0, 0)  # no magnetometer
             for ns, six in zip(device_ns.tolist(), counts, strict=True)

@@ -24,7 +24,7 @@ from pymavlink.dialects.v20 import ardupilotmega
 
 from links.mavlink.transport.framing import FrameSplitter, header, packed, parse_frame
 from links.simulated.autopilot.autopilot import STANDARD_GRAVITY_MPS2, Autopilot
-from links.simulated.autopilot.flight_stack.commands import SET_MESSAGE_INTERVAL
+from links.simulated.autopilot.flight_stack.commands import AUTOPILOT_VERSION, SET_MESSAGE_INTERVAL, version_message
 from links.simulated.autopilot.flight_stack.streams import HIGHRES_IMU, RAW_IMU, Streams
 from links.simulated.autopilot.px4_rules import Px4Rules
 from links.simulated.autopilot.rules import Rules
@@ -122,6 +122,9 @@ class AutopilotSocket(UdpThread):
         elif kind == "COMMAND_LONG" and message.command == SET_MESSAGE_INTERVAL:
             result = self._streams.set_interval(round(message.param1), message.param2, message.param3)
             self._send(mavlink.MAVLink_command_ack_message(message.command, result))
+        elif kind == "COMMAND_LONG" and (message.command, message.param1) == (REQUEST_MESSAGE, AUTOPILOT_VERSION):
+            self._send(mavlink.MAVLink_command_ack_message(message.command, 0))
+            self._send(version_message(self._px4))
         elif kind == "COMMAND_LONG":
             is_origin_request = message.command == REQUEST_MESSAGE and message.param1 == GPS_GLOBAL_ORIGIN
             self._send(mavlink.MAVLink_command_ack_message(message.command, 0 if is_origin_request else UNSUPPORTED))

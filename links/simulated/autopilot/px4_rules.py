@@ -36,7 +36,7 @@ class Px4Rules(Rules):
     """PX4 with EKF2_EV_CTRL position and yaw, without GPS and compass. Parameters have their PX4 names."""
 
     ekf2_evp_noise: float = 0.1
-    ekf2_eva_noise: float = 0.1
+    ekf2_eva_noise: float = 0.05  # of the variance, unsquared
     ekf2_ev_qmin: int = 0
     ekf2_ev_delay_ms: int = 0
     compass: bool = False  # EKF2_MAG_TYPE other than 5: a position in LOCAL_NED needs no rotation
@@ -83,7 +83,7 @@ class Px4Rules(Rules):
             yaw_of(R),
             velocity,
             _at_least(max(position_var), self.ekf2_evp_noise),
-            _at_least(angle_var[2], self.ekf2_eva_noise),
+            _at_least(angle_var[2], math.sqrt(self.ekf2_eva_noise)),
             message.reset_counter,
             message.quality,
         )

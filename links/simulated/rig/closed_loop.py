@@ -30,6 +30,7 @@ from flow.taps import Digest
 from links.dynamixel import Servo
 from links.dynamixel.servo import NOT_LIVE, GoalCommand
 from links.lidar import Lidar
+from links.mavlink.poses.sent_frame import SentFrame
 from links.runs.request import RunRequest
 from links.simulated.rig.pose_loop import PoseLoop, PoseTap, has_autopilot
 from links.simulated.sensors.servo import STEP_NS
@@ -125,9 +126,9 @@ class ClosedLoop:
         return (first_ns[True] - min(first_ns.values())) * 1e-9 if True in first_ns else None
 
     @property
-    def axes_yaw_rad(self) -> float | None:
-        """Yaw in `map` of the axes that poses are sent in [rad]; None: none was sent."""
-        return None if self._poses is None else self._poses.axes_yaw_rad
+    def sent_frame(self) -> SentFrame | None:
+        """Frame that poses are sent in; None: none was sent."""
+        return None if self._poses is None else self._poses.sent_frame
 
     def sent(self) -> list[Record]:
         """Frames to the autopilot since the last call, stamped with the time at which they leave the host."""

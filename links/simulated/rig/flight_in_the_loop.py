@@ -65,14 +65,14 @@ class FlightInTheLoop:
         if self._loop is None:
             return []
         frames = self._loop.sent()
-        if self._loop.axes_yaw_rad is not None:
-            self.stack.axes_yaw_rad = self._loop.axes_yaw_rad
+        if self._loop.sent_frame is not None:
+            self.stack.sent_frame = self._loop.sent_frame
         for frame in frames:
             if frame.stamp_ns != frame.arrival_ns:
                 continue  # of an earlier run: recorded again, not sent
             self.stack.receive(frame.data, frame.arrival_ns)
             if self._outcome is not None:
-                self._outcome.on_sent(frame, self._loop.axes_yaw_rad or 0.0)
+                self._outcome.on_sent(frame, self._loop.sent_frame)
         return frames
 
     def result(self) -> Outcome | None:

@@ -28,7 +28,7 @@ from flow.link import TRUTH_TOPICS, LinkError, Record
 from flow.metrics import Latency
 from links.clock import host_time
 from links.mavlink.frame_decoder import ARMED
-from links.mavlink.profiles import required_parameters
+from links.mavlink.profiles import best_values, required_parameters
 from links.recording import RecordingWriter
 from links.runs.truth import TRUTH_RECORDING
 from links.simulated.autopilot.ardupilot_rules import ArduPilotRules
@@ -201,7 +201,7 @@ class RealTimeRig:
             send_to=send_to,
             flight=flight,
             scenario_ns=simulation.now_ns,
-            parameters={w.name: w.best for w in required_parameters("ardupilot", "none")},
+            parameters=best_values(required_parameters("ardupilot", "none")),
         )
         autopilot.armed = self._rig.armed
         return autopilot

@@ -17,6 +17,7 @@ from flow.message import Message
 from flow.replay import Replay
 from links.mavlink import Autopilot
 from links.mavlink.autopilot_session import WAKE_S
+from links.mavlink.poses.sent_frame import SentFrame
 from stages.messages import RelativePose
 
 TICK_NS = round(1e9 * WAKE_S)
@@ -111,9 +112,9 @@ class PoseLoop:
         return next(self._session.receive(record.data, PEER, record.arrival_ns), None)
 
     @property
-    def axes_yaw_rad(self) -> float | None:
-        """Yaw in `map` of the axes that poses are sent in [rad]; None: none was sent."""
-        return self._session.poses.axes_yaw_rad if self._next_tick_ns is not None else None
+    def sent_frame(self) -> SentFrame | None:
+        """Frame that poses are sent in; None: none was sent."""
+        return self._session.poses.frame if self._next_tick_ns is not None else None
 
     def sent(self) -> list[Record]:
         """Records of what was sent since the last call."""

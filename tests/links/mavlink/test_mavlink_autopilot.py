@@ -19,7 +19,9 @@ from flow.message import check_arrays
 from flow.stage import output_ports
 from links.importing import import_file
 from links.mavlink import Autopilot
+from links.mavlink.readers import read_raw_imu
 from links.recording import RecordingReader
+from links.simulated.autopilot.flight_stack.telemetry import imu_counts
 from stages.messages import (
     AutopilotEstimator,
     AutopilotStatus,
@@ -110,6 +112,17 @@ def test_odometry_has_the_velocity_in_the_body_and_rotation_first_in_its_covaria
     assert (message.reset_counter, message.quality_percent) == (9, 80)
 
 
+def test_the_odometry_of_px4_has_its_velocity_in_ned():
+    """It faces east: 4 m/s north are to its left."""
+    q = (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))
+    message = Autopilot().decode(record(Sender().frame(odometry(q=q, frame=1, child=1))))
+    assert isinstance(message, DroneOdometry)
+    check_arrays(message)
+    np.testing.assert_allclose(message.velocity_drone_mps, [5, 4, -6], atol=1e-6)
+    np.testing.assert_allclose(message.angular_velocity_drone_radps, [0.1, -0.2, -0.3], rtol=1e-6)
+    assert message.velocity_covariance is None
+
+
 def test_an_odometry_without_covariance_or_quality_has_none():
     message = Autopilot().decode(record(Sender().frame(odometry(upper=[math.nan] * 21, quality=0))))
     assert isinstance(message, DroneOdometry)
@@ -142,12 +155,25 @@ def test_both_imus_are_si_in_drone_axes_and_gravity_is_measured_upwards():
     highres = mavlink.MAVLink_highres_imu_message(
         7_000_000, 0.980665, 1.96133, -9.80665, 0.01, 0.02, 0.03, 0, 0, 0, math.nan, 0, 0, 0, 63
     )
-    for message in (raw, highres):
+    for message, half in ((raw, 0.0005), (highres, 0.0)):  # the counts of RAW_IMU are truncated
         imu = Autopilot().decode(record(Sender().frame(message)))
         assert isinstance(imu, DroneImu)
         check_arrays(imu)
-        np.testing.assert_allclose(imu.acceleration_drone_mps2, [0.980665, -1.96133, 9.80665], rtol=1e-6)
-        np.testing.assert_allclose(imu.angular_velocity_drone_radps, [0.01, -0.02, -0.03], rtol=1e-6)
+        acceleration = 9.80665 * np.array([0.1 + half, -0.2 - half, 1.0 + half])
+        np.testing.assert_allclose(imu.acceleration_drone_mps2, acceleration, rtol=1e-6)
+        turn = [0.01 + half, -0.02 - half, -0.03 - half]
+        np.testing.assert_allclose(imu.angular_velocity_drone_radps, turn, rtol=1e-6)
+
+
+@pytest.mark.parametrize("rate_radps", [0.0, 0.0007, -0.0042, 0.031])
+def test_the_mean_of_truncated_counts_is_that_of_the_rate(rate_radps: float):
+    """With a noise of 5 mrad/s. As they are, counts of a slow rate have 8 % less than it."""
+    rates = np.random.default_rng(1).normal(rate_radps, 5e-3, 40_000)
+    counts = [imu_counts(np.array([rate, 0.0, 0.0, 0.0, 0.0, 9.81]))[3] for rate in rates.tolist()]
+    zeros = [0] * 5
+    frames = {n: mavlink.MAVLink_raw_imu_message(1, 0, 0, -1000, n, *zeros) for n in set(counts)}
+    read = {n: read_raw_imu(frame, 0).angular_velocity_drone_radps[0] for n, frame in frames.items()}
+    assert np.mean([read[n] for n in counts]) == pytest.approx(np.mean(rates), abs=2e-5)
 
 
 def test_the_magnetic_field_is_in_microtesla_and_drone_axes():

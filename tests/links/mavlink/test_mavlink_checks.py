@@ -11,10 +11,10 @@ from pymavlink.dialects.v20 import ardupilotmega as m
 
 from flow.link import LinkError, Record
 from links.mavlink import Autopilot
-from links.mavlink.checks import autopilot_checks, parameter_check
+from links.mavlink.checks import _estimate, autopilot_checks, parameter_check, version_check
 from links.mavlink.origin import OriginState
 from links.mavlink.parameters import ParameterValues, ask_parameters
-from links.mavlink.profiles import required_parameters
+from links.mavlink.profiles import ARDUPILOT, PX4, required_parameters
 from links.mavlink.transport.framing import packed
 from links.preflight.check_result import Level
 from stages.messages import AutopilotEstimator, AutopilotStatus
@@ -181,6 +181,21 @@ def test_parameters_are_compared_with_the_profile(profile):
     assert "none was received" in parameter_check("it", required, ParameterValues({}, list(good), 9)).sentence
 
 
+@pytest.mark.parametrize(
+    ("profile", "version", "level", "text"),
+    [
+        (ARDUPILOT, (4, 6, 3), Level.OK, "ardupilot 4.6.3"),
+        (ARDUPILOT, (4, 5, 7), Level.FAIL, "ardupilot 4.5.7: 4.6 or later is needed: earlier ones reset"),
+        (ARDUPILOT, None, Level.WARNING, "did not answer"),
+        (PX4, (1, 16, 0), Level.OK, "px4 1.16.0"),
+        (PX4, (1, 13, 3), Level.FAIL, "1.14 or later is needed"),
+    ],
+)
+def test_a_firmware_that_is_too_old_is_found(profile, version, level, text):
+    result = version_check("it", profile, version)
+    assert (result.level, text in result.sentence) == (level, True)
+
+
 def test_a_full_disk_for_the_signing_time_is_an_error_in_preflight(tmp_path, monkeypatch):
     def full(descriptor):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -197,6 +212,20 @@ def test_the_clock_drift_is_reported_if_known():
     drifting = dataclasses.replace(status(), clock_drift_ppm=-18.04, clock_drift_sigma_ppm=1.4)
     assert "drift -18.0 +- 1.4 ppm" in check(frames(), newest=drifting)["it clock"].sentence
     assert "drift" not in check(frames())["it clock"].sentence
+
+
+@pytest.mark.parametrize(
+    ("yaw", "estimates", "level", "text"),
+    [
+        ("measured", estimator(attitude=False, position=False), Level.WARNING, "normal without compass"),
+        ("measured", estimator(attitude=False, ratio=1.6), Level.FAIL, "rejects velocity"),
+        ("none", estimator(attitude=False), Level.FAIL, "no attitude yet"),
+    ],
+)
+def test_px4_without_compass_has_no_yaw_before_poses(yaw, estimates, level, text):
+    link = Autopilot(connection="udpin:127.0.0.1:0", profile="px4", yaw=yaw)
+    result = _estimate("it", link, [estimates])
+    assert (result.level, text in result.sentence) == (level, True)
 
 
 @pytest.mark.parametrize(

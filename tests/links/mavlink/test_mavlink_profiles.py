@@ -16,6 +16,7 @@ from links.mavlink.profiles import (
     ProfileName,
     RequiredParameter,
     YawOutput,
+    best_values,
     findings,
     required_parameters,
 )
@@ -28,27 +29,24 @@ from links.simulated.autopilot.px4_rules import Px4Rules
 ALL = [(profile, yaw) for profile in PROFILES for yaw in ("none", "measured")]
 
 
-def valid(required: tuple[RequiredParameter, ...]) -> dict[str, float]:
-    """Allowed values."""
-    return {parameter.name: parameter.best for parameter in required}
-
-
 @pytest.mark.parametrize(("profile", "yaw"), ALL)
 @pytest.mark.parametrize("source_set", [1, 2, 3])
 def test_names_fit_the_message_field_and_each_has_a_reason(profile: ProfileName, yaw: YawOutput, source_set: int):
     required = required_parameters(profile, yaw, source_set)
     names = [parameter.name for parameter in required]
-    assert len(set(names)) == len(names)
+    always = [parameter.name for parameter in required if parameter.when is None]
+    assert len(set(always)) == len(always)
+    assert {parameter.when[0] for parameter in required if parameter.when} <= {*always, "EK3_SRC1_POSXY"}
     assert all(0 < len(name) <= 16 for name in names)
     assert all(parameter.why for parameter in required)
-    assert findings(required, valid(required)) == []
+    assert findings(required, best_values(required)) == []
 
 
 @pytest.mark.parametrize(("profile", "yaw"), ALL)
 def test_each_wrong_or_missing_parameter_is_one_sentence(profile: ProfileName, yaw: YawOutput):
     required = required_parameters(profile, yaw)
-    values = valid(required)
-    first, second = required[0].name, required[1].name
+    values = best_values(required)
+    first, second = (parameter.name for parameter in required[:2])
     values[first] = 102.0
     del values[second]
     found = findings(required, values)
@@ -78,15 +76,33 @@ def test_a_source_that_does_not_fit_what_is_sent_is_found(
     profile: ProfileName, yaw: YawOutput, name: str, value: float, why: str
 ):
     required = required_parameters(profile, yaw)
-    (found,) = findings(required, valid(required) | {name: value})
+    (found,) = findings(required, best_values(required) | {name: value})
     assert found.startswith(f"{name} is {value:g}, but must be")
     assert why in found
+
+
+@pytest.mark.parametrize(
+    ("yaw", "changes", "why"),
+    [
+        ("none", {"EK3_SRC1_YAW": 1.0, "EK3_SRC2_YAW": 3.0}, "as EK3_SRC1_YAW"),
+        ("none", {"EK3_SRC1_YAW": 2.0, "EK3_SRC2_YAW": 2.0}, None),
+        ("measured", {"EK3_SRC1_YAW": 1.0, "EK3_SRC2_YAW": 6.0}, None),
+        ("measured", {"EK3_SRC1_POSXY": 0.0, "EK3_SRC2_POSZ": 1.0}, "without a position in set 1"),
+        ("measured", {"EK3_SRC1_POSXY": 3.0, "EK3_SRC2_POSZ": 1.0}, None),
+        ("measured", {"EK3_SRC1_POSXY": 0.0, "EK3_SRC2_POSZ": 6.0}, None),
+    ],
+)
+def test_a_parameter_may_depend_on_another(yaw: YawOutput, changes: dict[str, float], why: str | None):
+    required = required_parameters("ardupilot", yaw)
+    found = findings(required, best_values(required) | changes)
+    assert len(found) == (why is not None)
+    assert all(str(why) in text for text in found)
 
 
 def test_a_mask_without_the_check_of_visual_odometry_lets_the_drone_arm():
     required = required_parameters("ardupilot", "none")
     all_but_it = float((1 << 20) - 2 - (1 << 18))
-    assert findings(required, valid(required) | {"ARMING_CHECK": all_but_it}) == []
+    assert findings(required, best_values(required) | {"ARMING_CHECK": all_but_it}) == []
 
 
 @pytest.mark.parametrize(
@@ -108,7 +124,7 @@ def test_values_ranges_and_bits(parameter: RequiredParameter, allowed: list[floa
 )
 def test_parameters_are_read_over_a_socket_and_missing_ones_are_named(rules: Any, profile: Profile):
     required = required_parameters(profile.name, "none")
-    values = valid(required)
+    values = best_values(required)
     absent = required[-1].name
     sent = {name: value for name, value in values.items() if name != absent}
     with AutopilotSocket(rules, parameters=sent) as drone:
@@ -121,6 +137,8 @@ def test_parameters_are_read_over_a_socket_and_missing_ones_are_named(rules: Any
     assert received.missing == [absent]
     assert received.values == pytest.approx(sent)
     assert received.frames >= len(sent)
+    assert received.version is not None
+    assert received.version[:2] >= profile.least_version
     assert len(findings(required, received.values)) == 1
 
 

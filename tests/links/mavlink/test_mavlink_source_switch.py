@@ -18,7 +18,8 @@ from links.mavlink.poses.agreement import MotionAgreement
 from links.mavlink.poses.autopilot_estimate import AutopilotAttitude, AutopilotEstimate, AutopilotPosition
 from links.mavlink.poses.gate import PoseLimits
 from links.mavlink.poses.odom_frame import odom_yaw_rad
-from links.mavlink.profiles import required_parameters
+from links.mavlink.poses.sent_frame import SentFrame
+from links.mavlink.profiles import best_values, required_parameters
 from links.mavlink.source_switch import SET_EKF_SOURCE_SET, SourceSwitch
 from links.mavlink.transport.framing import packed, parse_frame
 from links.simulated.autopilot.flight_stack.stack import FlightStack
@@ -44,7 +45,7 @@ class Flight:
     def __init__(self, **parameters: float) -> None:
         self.texts: list[str] = []
         self.switch = SourceSwitch(2, REQUIRED, (1, 1), (1, 197), self.texts.append, SIGMA_M)
-        self.values = {p.name: p.best for p in REQUIRED} | parameters
+        self.values = best_values(REQUIRED) | parameters
         self.now_ns, self.step = HOST0, 0
         self.results: list[int | None] = []  # of the next requests; then ACCEPTED; None: no answer
         self.requested: list[int] = []
@@ -55,7 +56,8 @@ class Flight:
         self.measured = True
         self.own_speed_mps = 1.0
         self.autopilot = AutopilotEstimate()
-        self.axes_yaw_rad: float | None = None
+        self.frame: SentFrame | None = None
+        self.shift_m = np.zeros(3)  # of the frame of the poses
 
     def fly(self, seconds: float) -> Flight:
         for _ in range(round(50 * seconds)):
@@ -91,8 +93,10 @@ class Flight:
             self.autopilot.attitude = AutopilotAttitude(0.0, 0.0, self.compass_rad, self.now_ns)
             own_yaw_rad = odom_yaw_rad(pose, self.autopilot)
             assert own_yaw_rad is not None
-            axes_yaw_rad = self.axes_yaw_rad = own_yaw_rad if self.axes_yaw_rad is None else self.axes_yaw_rad
-            self.switch.on_sent(pose, axes_yaw_rad, axes_yaw_rad - own_yaw_rad, self.autopilot, self.now_ns)
+            if self.frame is None:
+                assert pose.xyz_map_m is not None
+                self.frame = SentFrame.through(own_yaw_rad, pose.xyz_map_m, np.array([50.0, -7.0, 30.0]) + self.shift_m)
+            self.switch.on_sent(pose, self.frame, self.frame.yaw_rad - own_yaw_rad, self.autopilot, self.now_ns)
 
     def _answer(self, request: Any) -> None:
         if request.get_type() == "PARAM_REQUEST_READ":
@@ -113,6 +117,19 @@ class Flight:
     def say(self, text: str) -> None:
         frame = packed(mavlink.MAVLink_statustext_message(6, text.encode()), mavlink.MAVLink(None))
         self.switch.on_message(parse_frame(frame), self.now_ns)
+
+
+def test_no_switch_is_requested_that_would_move_the_position_far():
+    """As after a long drive, whose odometry has drifted against GPS."""
+    flight = Flight()
+    flight.shift_m = np.array([12.0, 0.0, 0.0])
+    flight.fly(20.0)
+    assert flight.requested == []
+    assert flight.texts == ["no source switch: it would be 12 m"]
+    assert "the position would move by 12 m" in str(flight.switch.status)
+    flight.flags, flight.autopilot.position = NO_POSITION, None  # its GPS is lost: there is no position to move
+    flight.fly(20.0)
+    assert flight.requested == [2]
 
 
 def test_the_set_is_requested_once_when_poses_are_sent_and_move_as_the_autopilot_does():
@@ -158,7 +175,7 @@ def test_a_drone_that_hovers_gives_no_evidence_that_its_poses_are_right():
     for _ in range(1500):
         now_ns += 20 * MS
         autopilot.position = AutopilotPosition(now_ns, np.array([1.0, 2.0, 3.0]), np.zeros(3))
-        assert agreement.add(good_pose(now_ns), 0.0, autopilot) is None
+        assert agreement.add(good_pose(now_ns), SentFrame(0.0, np.zeros(3)), autopilot) is None
     assert not agreement.agrees(now_ns)
 
 
@@ -171,7 +188,7 @@ def agreed_after(ends: list[dict[str, Any]]) -> bool:
         autopilot.attitude = AutopilotAttitude(0.0, 0.0, 0.0, now_ns)
         changes = ends[step - 300] if step >= 300 else {}
         pose = dataclasses.replace(good_pose(now_ns, xyz_map_m=xyz_m, R_map_drone=np.eye(3)), odom_yaw_rad=None)
-        agreement.add(dataclasses.replace(pose, **changes), 0.0, autopilot)
+        agreement.add(dataclasses.replace(pose, **changes), SentFrame(0.0, np.zeros(3)), autopilot)
     return agreement.agrees(now_ns)
 
 
@@ -318,7 +335,7 @@ def test_a_reopened_link_knows_the_set_in_use_and_what_the_pilot_selected_until_
 def test_over_a_socket_the_request_is_made_and_its_acknowledgement_read(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(source_switch, "MIN_SENDING_NS", 500 * MS)
     monkeypatch.setattr(source_switch, "PARAMETER_PERIOD_NS", 20 * MS)
-    values = {p.name: p.best for p in REQUIRED}
+    values = best_values(REQUIRED)
     sender, requested = mavlink.MAVLink(None, srcSystem=1, srcComponent=1), []
     with listening(switch_source=True) as listener, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
         link_address = "127.0.0.1", listener.link.port

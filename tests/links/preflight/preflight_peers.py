@@ -10,7 +10,7 @@ from pymavlink.dialects.v20 import ardupilotmega
 
 from flow.link import Record
 from flow.stage import Settings, Stage
-from links.mavlink.profiles import required_parameters
+from links.mavlink.profiles import best_values, required_parameters
 from links.mavlink.transport.framing import packed, parse_frame
 from links.simulated.autopilot.autopilot import Autopilot, AutopilotSettings
 from links.simulated.sensors.lidar_packets import PacketEncoder
@@ -34,7 +34,7 @@ def packet(first_pulse_ns: int, mode: str = "strongest") -> bytes:
 
 def good_parameters(profile="ardupilot") -> dict[str, float]:
     """The best allowed value of each parameter of a profile."""
-    return {w.name: w.best for w in required_parameters(profile, "none")}
+    return best_values(required_parameters(profile, "none"))
 
 
 def flight() -> Autopilot:

@@ -17,7 +17,7 @@ from links.simulated.autopilot.flight_stack.streams import ACCEPTED, DENIED, FAI
 mavlink: Any = ardupilotmega
 SET_MESSAGE_INTERVAL, GET_MESSAGE_INTERVAL, REQUEST_MESSAGE = 511, 510, 512
 SET_EKF_SOURCE_SET, REBOOT = 42007, 246
-GPS_GLOBAL_ORIGIN = 49
+GPS_GLOBAL_ORIGIN, AUTOPILOT_VERSION = 49, 148
 REAL32, INT32 = 9, 6  # MAV_PARAM_TYPE
 
 
@@ -65,8 +65,11 @@ def handle_frame(vehicle: Vehicle, frame: bytes, device_ns: int) -> None:
     elif kind == "COMMAND_LONG":
         result = _command(vehicle, message, device_ns)
         vehicle.send(mavlink.MAVLink_command_ack_message(message.command, result))
-        if result == ACCEPTED and message.command == REQUEST_MESSAGE and vehicle.origin is not None:
-            send_origin(vehicle, device_ns)
+        if result == ACCEPTED and message.command == REQUEST_MESSAGE:
+            if int(message.param1) == AUTOPILOT_VERSION:
+                vehicle.send(version_message(vehicle.px4))
+            else:
+                send_origin(vehicle, device_ns)
         if result == ACCEPTED and message.command == GET_MESSAGE_INTERVAL:
             interval_us = vehicle.streams.interval_us(int(message.param1)) or 0
             vehicle.send(mavlink.MAVLink_message_interval_message(int(message.param1), interval_us))
@@ -83,13 +86,19 @@ def send_origin(vehicle: Vehicle, device_ns: int) -> None:
         vehicle.send(mavlink.MAVLink_gps_global_origin_message(*vehicle.origin, device_ns // 1000))
 
 
+def version_message(px4: bool) -> Any:
+    """AUTOPILOT_VERSION of the firmware whose rules are simulated: ArduPilot 4.6.3, PX4 1.15.4, official."""
+    version = int.from_bytes(bytes((1, 15, 4, 255) if px4 else (4, 6, 3, 255)))
+    return mavlink.MAVLink_autopilot_version_message(0, version, 0, 0, 0, *[[0] * 8] * 3, 0, 0, 0)
+
+
 def _command(vehicle: Vehicle, message: Any, device_ns: int) -> int:
     if message.command == SET_MESSAGE_INTERVAL:
         return vehicle.streams.set_interval(int(message.param1), message.param2, message.param3)
     if message.command == GET_MESSAGE_INTERVAL:
         return FAILED if vehicle.streams.interval_us(int(message.param1)) is None else ACCEPTED
     if message.command == REQUEST_MESSAGE:
-        return ACCEPTED if int(message.param1) == GPS_GLOBAL_ORIGIN else UNSUPPORTED
+        return ACCEPTED if int(message.param1) in (GPS_GLOBAL_ORIGIN, AUTOPILOT_VERSION) else UNSUPPORTED
     if message.command == SET_EKF_SOURCE_SET and not vehicle.px4:
         return ACCEPTED if vehicle.use_sources(int(message.param1)) else DENIED
     if message.command == REBOOT:

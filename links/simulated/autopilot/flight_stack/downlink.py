@@ -107,7 +107,7 @@ def _message(
         return telemetry.local_position(device_ns, estimate) if known else None
     if message == streams.ODOMETRY:
         resets = core.lane.reset_count
-        return telemetry.odometry(device_ns, estimate, gyro, core.lane.P, resets) if known else None
+        return telemetry.odometry(device_ns, estimate, gyro, core.lane.P, resets, ekf.px4) if known else None
     if message == streams.RAW_IMU:
         return telemetry.raw_imu(device_ns, sample, field_ut)
     if message == streams.SCALED_IMU:

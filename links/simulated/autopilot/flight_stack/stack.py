@@ -18,7 +18,8 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega
 
 from flow.link import Record
-from links.mavlink.profiles import required_parameters
+from links.mavlink.poses.sent_frame import SentFrame
+from links.mavlink.profiles import best_values, required_parameters
 from links.simulated.autopilot.autopilot import AutopilotSettings
 from links.simulated.autopilot.flight_stack.commands import handle_frame, send_origin
 from links.simulated.autopilot.flight_stack.downlink import Downlink
@@ -75,7 +76,7 @@ class FlightStack:
         self.own, self.px4 = (1, 1), s.kind == "px4"
         fuses_yaw = any(SOURCE_SETS[name].yaw is AidingSource.EXTERNAL for name in s.source_sets[1:])
         required = required_parameters(s.kind, "measured" if fuses_yaw else "none")
-        self.parameters: dict[str, float] = {parameter.name: parameter.best for parameter in required}
+        self.parameters = best_values(required)
         if not self.px4:
             self.parameters["EK3_SRC_OPTIONS"] = float(s.source_options)
         self._downlink = Downlink(settings, start_ns, seed)
@@ -86,8 +87,8 @@ class FlightStack:
         home = np.array([position[0], position[1], ground_m + 0.2]) if s.on_ground else position
         self._home, self._world_yaw = home, -math.radians(settings.heading_of_world_x_deg)
         self._map = vehicle.at(np.zeros(1))[0][0], float(vehicle.at(np.zeros(1))[3][0])  # position and yaw of map
-        self.axes_yaw_rad: float | None = None
-        """Yaw in `map` of the axes of external positions, as grd states it; None: not known, they point north."""
+        self.sent_frame: SentFrame | None = None
+        """Frame of external positions, as grd states it; None: not known, with axes that point north."""
         self.quadrotor = Quadrotor(s, home, float(yaw), ground_m, duration_s, seed)
         self.motion = self.quadrotor.motion
         self._sensors, self._tick = Sensors(s, seed), 0
@@ -245,11 +246,15 @@ class FlightStack:
         return [SOURCE_SETS[name].position is AidingSource.EXTERNAL for name in self.settings.source_sets]
 
     def _frame(self) -> SurveyFrame:
-        """Where the sources in use put the world: GPS in axes that point north, external ones in those of grd."""
+        """Where the sources in use put the world: GPS in axes that point north, external ones in the frame of grd."""
         sources, (map_m, map_yaw) = self.ekf.sources, self._map
-        external = sources.position is AidingSource.EXTERNAL
-        yaw = -map_yaw - self.axes_yaw_rad if external and self.axes_yaw_rad is not None else self._world_yaw
-        xyz = -rotate(map_m if external else self._home, yaw)
+        external, sent = sources.position is AidingSource.EXTERNAL, self.sent_frame
+        if external and sent is not None:
+            yaw = -map_yaw - sent.yaw_rad
+            xyz = sent.offset_m - rotate(map_m, yaw)
+        else:
+            yaw = self._world_yaw
+            xyz = -rotate(map_m if external else self._home, yaw)
         if sources.height is not AidingSource.EXTERNAL:
             xyz[2] = -self._home[2]
         return SurveyFrame(yaw, xyz)

@@ -40,19 +40,22 @@ def local_position(device_ns: int, estimate: Array64) -> Any:
     return mavlink.MAVLink_local_position_ned_message(device_ns // MS, *flip_yz(estimate[0:3]), *flip_yz(estimate[3:6]))
 
 
-def odometry(device_ns: int, estimate: Array64, gyro: Array64, P: Array64, resets: int) -> Any:
-    """ODOMETRY in LOCAL_FRD and BODY_FRD, with the filter's covariance P (15, 15)."""
+def odometry(device_ns: int, estimate: Array64, gyro: Array64, P: Array64, resets: int, px4: bool) -> Any:
+    """ODOMETRY with the filter's covariance P (15, 15): LOCAL_FRD and BODY_FRD; PX4: all but the rates in LOCAL_NED."""
     R = rotation_of(estimate)
+    frames = (mavlink.MAV_FRAME_LOCAL_FRD, mavlink.MAV_FRAME_BODY_FRD)
+    velocity_mps = R.T @ estimate[3:6]
+    if px4:
+        frames, velocity_mps = (mavlink.MAV_FRAME_LOCAL_NED, mavlink.MAV_FRAME_LOCAL_NED), estimate[3:6]
     covariance, velocity = np.zeros((6, 6)), np.zeros((6, 6))
     covariance[:3, :3], covariance[3:, 3:] = P[6:9, 6:9], R.T @ P[0:3, 0:3] @ R
     velocity[:3, :3], velocity[3:, 3:] = P[9:12, 9:12], R.T @ P[3:6, 3:6] @ R
     return mavlink.MAVLink_odometry_message(
         device_ns // US,
-        mavlink.MAV_FRAME_LOCAL_FRD,
-        mavlink.MAV_FRAME_BODY_FRD,
+        *frames,
         *flip_yz(estimate[0:3]),
         wxyz_from_R_odom_drone(R),
-        *flip_yz(R.T @ estimate[3:6]),
+        *flip_yz(velocity_mps),
         *flip_yz(gyro),
         upper_from_pose_covariance(covariance, R),
         upper_from_velocity_covariance(velocity),
@@ -84,9 +87,9 @@ def field_counts(field_ut: Array64) -> list[int]:
 
 
 def imu_counts(sample: Array64) -> list[int]:
-    """mg and mrad/s as integers, FRD axes, clipped to 16 bits."""
+    """mg and mrad/s as integers, FRD axes, clipped to 16 bits; ArduPilot converts by truncation."""
     counts = np.concatenate([flip_yz(sample[3:6]) / STANDARD_GRAVITY_MPS2, flip_yz(sample[0:3])]) * 1e3
-    return np.clip(np.rint(counts), -INT16, INT16).astype(int).tolist()
+    return np.clip(np.trunc(counts), -INT16, INT16).astype(int).tolist()
 
 
 def status_flags(*, attitude: bool, velocity: bool, position: bool, height: bool, constant: bool, gps: bool) -> int:

@@ -136,8 +136,11 @@ def test_while_the_estimate_does_not_jump_positions_keep_the_axes_of_the_first()
     assert (same.x, same.y, same.pose_covariance) == (first.x, first.y, first.pose_covariance)
     jumped = sent(40, odom_yaw_rad=0.25, resets=good_pose().resets + 1, **sharp)
     assert jumped.reset_counter == first.reset_counter + 1
-    assert jumped.y != pytest.approx(first.y, abs=0.5)
-    assert sent(60, odom_yaw_rad=0.0, resets=good_pose().resets + 1, **coarse).y == jumped.y
+    assert (jumped.x, jumped.y) == pytest.approx((first.x, first.y))
+    resets, moved = good_pose().resets + 1, {"xyz_map_m": np.array([111.0, 2.0, 10.0])}
+    for at_ms, yaw_rad in ((60, 0.25), (80, 0.0)):
+        message = sent(at_ms, odom_yaw_rad=yaw_rad, resets=resets, **moved, **coarse)
+        assert message.y == pytest.approx(first.y + 10.0 * math.sin(0.25), abs=1e-4)
 
 
 @pytest.mark.parametrize("was_sent", [True, False])

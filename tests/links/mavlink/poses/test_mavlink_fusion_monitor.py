@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import pytest
@@ -19,8 +20,12 @@ def report(ratio: float) -> Any:
     return mavlink.MAVLink_ekf_status_report_message(0, 0.1, ratio, 0.1, 0.1, 0.0)
 
 
-def estimator_status(ratio: float) -> Any:
-    return mavlink.MAVLink_estimator_status_message(0, 0, 0.1, ratio, 0.1, 0.1, 0.0, 0.0, 0.1, 0.1)
+def estimator_status(ratio: float, flags: int = 0) -> Any:
+    return mavlink.MAVLink_estimator_status_message(0, flags, 0.1, ratio, 0.1, 0.1, 0.0, 0.0, 0.1, 0.1)
+
+
+def gps_glitch(ratio: float) -> Any:
+    return estimator_status(ratio, mavlink.ESTIMATOR_GPS_GLITCH)
 
 
 class Flight:
@@ -101,3 +106,31 @@ def test_a_boot_ends_the_stop():
     assert flight.sender.fusion.stopped
     flight.sender.on_boot()
     assert flight.fly(0.2, 0.3) == 10
+
+
+def test_px4_that_fuses_nothing_any_more_receives_poses_again():
+    """Without GPS its ratio is NaN as soon as poses have ended."""
+    flight = Flight()
+    assert flight.fly(2.0, 1.4, estimator_status) < 50
+    assert flight.fly(2.9, math.nan, estimator_status) == 0
+    assert flight.fly(2.0, math.nan, estimator_status) > 80
+    assert flight.fly(2.0, 0.2, estimator_status) == 100
+
+
+def test_a_ratio_during_a_gps_glitch_is_not_that_of_the_pose():
+    flight = Flight()
+    assert flight.fly(3.0, 1.4, gps_glitch) == 150
+    assert flight.fly(3.0, 1.4, estimator_status) < 50
+
+
+def test_after_a_stop_a_small_ratio_counts_whatever_the_flag_says():
+    flight = Flight()
+    assert flight.fly(2.0, 1.4, estimator_status) < 50
+    assert flight.fly(2.9, 0.1, gps_glitch) == 0
+    assert flight.fly(2.0, 0.1, gps_glitch) > 80
+
+
+def test_an_infinite_ratio_is_a_rejection():
+    flight = Flight()
+    assert flight.fly(2.0, math.inf, estimator_status) < 50
+    assert flight.fly(5.0, math.inf, estimator_status) == 0

@@ -7,13 +7,15 @@ import itertools
 import math
 from typing import Any
 
+import numpy as np
 import pytest
 
-from links.mavlink.poses.autopilot_estimate import AutopilotAttitude
+from links.mavlink.poses.autopilot_estimate import AutopilotAttitude, AutopilotPosition
 from links.mavlink.poses.gate import PoseLimits, RejectReason
 from links.mavlink.poses.pose_sender import PoseSender
 from links.mavlink.poses.status_texts import TEXT_BYTES, fitted
 from links.mavlink.profiles import YawOutput
+from stages.geometry.frames import rotation_z
 from stages.messages import PoseState
 from tests.links.mavlink.mavlink_poses import HOST0, MS, good_pose
 
@@ -22,7 +24,7 @@ class Output:
     """Sends poses at a rate and keeps the sent counters and texts."""
 
     def __init__(self, **settings: Any) -> None:
-        self.pose_sender = PoseSender(("odometry",), PoseLimits(), yaw="measured", **settings)
+        self.pose_sender = PoseSender(("odometry",), PoseLimits(), **{"yaw": "measured", **settings})
         self.now_ns = HOST0
         self.counters: list[int] = []
         self.sent: list[Any] = []
@@ -94,6 +96,152 @@ def test_with_yaw_a_learnt_yaw_that_is_not_sharp_counts_less_than_the_attitude()
     output.pose_sender.autopilot.attitude = AutopilotAttitude(0.0, 0.0, math.radians(60.0), HOST0)
     output.pose(odom_yaw_rad=math.radians(25.0), odom_yaw_sigma_rad=math.radians(3.0))
     assert yaw_ned_rad(output.sent[-1]) == pytest.approx(math.radians(60.0), abs=1e-6)
+
+
+def ned_m(message: Any) -> tuple[float, float, float]:
+    return message.x, message.y, message.z
+
+
+@pytest.mark.parametrize("yaw", ["none", "measured"])
+def test_poses_are_sent_in_the_frame_of_the_autopilots_position_at_the_first_one(yaw: YawOutput):
+    """It is 900 m north and 50 m west of its origin, 60 m high; `map` is 90 deg from its axes."""
+    output = Output(yaw=yaw)
+    autopilot = output.pose_sender.autopilot
+    autopilot.attitude = AutopilotAttitude(0.0, 0.0, math.pi / 2, HOST0)
+    autopilot.position = AutopilotPosition(HOST0, np.array([900.0, 50.0, 60.0]), np.zeros(3))
+    output.pose(odom_yaw_rad=math.pi / 2)
+    assert ned_m(output.sent[-1]) == pytest.approx((900.0, -50.0, -60.0), abs=1e-3)
+    autopilot.position = AutopilotPosition(HOST0, np.array([905.0, 45.0, 60.0]), np.zeros(3))  # its own, later
+    output.pose(odom_yaw_rad=math.pi / 2, xyz_map_m=np.array([101.0, 5.0, 11.0]))  # y of map is its x
+    assert ned_m(output.sent[-1]) == pytest.approx((903.0, -50.0, -61.0), abs=1e-3)
+    output.pose(odom_yaw_rad=math.pi / 2, resets=1)
+    assert ned_m(output.sent[-1]) == pytest.approx((900.0, -50.0, -60.0), abs=1e-3)
+    output.pose_sender.on_boot()  # its origin is another one
+    autopilot.attitude = AutopilotAttitude(0.0, 0.0, 0.0, output.now_ns)
+    autopilot.position = AutopilotPosition(output.now_ns, np.array([1.0, 2.0, 3.0]), np.zeros(3))
+    output.pose(odom_yaw_rad=0.0)
+    assert ned_m(output.sent[-1]) == pytest.approx((1.0, -2.0, -3.0), abs=1e-3)
+
+
+def test_a_frame_without_the_autopilots_position_begins_again_with_its_first_one():
+    output = Output()
+    output.pose(odom_yaw_rad=0.0)
+    assert ned_m(output.sent[-1]) == pytest.approx((101.0, -2.0, -10.0), abs=1e-3)
+    position = AutopilotPosition(output.now_ns, np.array([300.0, 400.0, 5.0]), np.zeros(3))
+    output.pose_sender.autopilot.position = position
+    output.pose(odom_yaw_rad=0.0)
+    output.pose(odom_yaw_rad=0.0, xyz_map_m=np.array([102.0, 2.0, 10.0]))
+    assert ned_m(output.sent[-2]) == pytest.approx((300.0, -400.0, -5.0), abs=1e-3)
+    assert ned_m(output.sent[-1]) == pytest.approx((301.0, -400.0, -5.0), abs=1e-3)
+    assert output.counters == [0, 1, 1]
+
+
+def test_a_frame_whose_pose_was_not_sent_is_none():
+    output = Output()
+    output.pose(odom_yaw_rad=0.0, sent=False)
+    position = AutopilotPosition(output.now_ns, np.array([900.0, 50.0, 60.0]), np.zeros(3))
+    output.pose_sender.autopilot.position = position
+    output.pose_sender.autopilot.attitude = AutopilotAttitude(0.0, 0.0, 1.0, output.now_ns)
+    output.pose(odom_yaw_rad=None)
+    assert ned_m(output.sent[-1]) == pytest.approx((900.0, -50.0, -60.0), abs=1e-3)
+    assert yaw_ned_rad(output.sent[-1]) == pytest.approx(1.0, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("away_m", "turned_deg", "begins_again"),
+    [(0.5, 0.0, False), (0.5, 10.0, False), (40.0, 0.0, True), (0.5, 90.0, True)],
+)
+def test_in_another_map_the_frame_begins_again_where_the_autopilot_is(
+    away_m: float, turned_deg: float, begins_again: bool
+):
+    """The vehicle's odometry restarts: the same place has other coordinates, and the body another yaw."""
+    output = Output()
+    autopilot = output.pose_sender.autopilot
+    autopilot.attitude = AutopilotAttitude(0.0, 0.0, 0.0, HOST0)
+    autopilot.position = AutopilotPosition(HOST0, np.array([900.0, 50.0, 60.0]), np.zeros(3))
+    output.pose(odom_yaw_rad=None)
+    R = rotation_z(math.radians(turned_deg))
+    other = {"xyz_map_m": np.array([101.0 + away_m, 2.0, 10.0]), "R_map_drone": R}
+    output.pose(odom_yaw_rad=None, resets=1, map_number=1, **other)
+    moved = (900.0, -50.0, -60.0) if begins_again else (900.0 + away_m, -50.0, -60.0)
+    assert ned_m(output.sent[-1]) == pytest.approx(moved, abs=1e-3)
+    assert yaw_ned_rad(output.sent[-1]) == pytest.approx(0.0 if begins_again else -math.radians(turned_deg), abs=1e-6)
+    assert output.counters == [0, 1]
+
+
+@pytest.mark.parametrize("jump", [{"resets": 1}, {"track_id": 2}, {"after_ms": 5000}])
+def test_in_the_same_map_the_frame_stays_wherever_the_autopilot_has_drifted(jump: dict[str, int]):
+    output = Output()
+    autopilot = output.pose_sender.autopilot
+    autopilot.position = AutopilotPosition(HOST0, np.array([900.0, 50.0, 60.0]), np.zeros(3))
+    output.pose(odom_yaw_rad=0.0)
+    drifted = AutopilotPosition(
+        output.now_ns + jump.get("after_ms", 0) * MS, np.array([915.0, 50.0, 60.0]), np.zeros(3)
+    )
+    autopilot.position = drifted
+    output.pose(odom_yaw_rad=0.0, **jump)
+    assert ned_m(output.sent[-1]) == pytest.approx((900.0, -50.0, -60.0), abs=1e-3)
+
+
+def test_in_another_map_the_frame_stays_while_the_autopilots_estimate_is_not_known():
+    """Its telemetry is silent."""
+    output = Output()
+    autopilot = output.pose_sender.autopilot
+    autopilot.attitude = AutopilotAttitude(0.0, 0.0, math.radians(60.0), HOST0)
+    autopilot.position = AutopilotPosition(HOST0, np.array([900.0, 50.0, 60.0]), np.zeros(3))
+    output.pose(odom_yaw_rad=None)
+    output.pose(odom_yaw_rad=None, after_ms=3000, map_number=1, resets=1)
+    assert ned_m(output.sent[-1]) == pytest.approx((900.0, -50.0, -60.0), abs=1e-3)
+    assert yaw_ned_rad(output.sent[-1]) == pytest.approx(math.radians(60.0), abs=1e-6)
+    autopilot.attitude = AutopilotAttitude(0.0, 0.0, math.radians(60.0), output.now_ns)
+    autopilot.position = AutopilotPosition(output.now_ns, np.array([800.0, 50.0, 60.0]), np.zeros(3))
+    output.pose(odom_yaw_rad=None, map_number=1, resets=1)
+    assert ned_m(output.sent[-1]) == pytest.approx((800.0, -50.0, -60.0), abs=1e-3)
+    assert output.counters == [0, 1, 2]
+
+
+def test_an_echo_of_the_poses_does_not_move_their_frame():
+    """Without GPS the autopilot's first position is grd's, 0.3 s late."""
+    output = Output()
+    output.pose(odom_yaw_rad=0.0)
+    output.pose_sender.autopilot.position = AutopilotPosition(output.now_ns, np.array([99.5, 2.0, 10.0]), np.zeros(3))
+    output.pose(odom_yaw_rad=0.0)
+    assert ned_m(output.sent[-1]) == pytest.approx((101.0, -2.0, -10.0), abs=1e-3)
+    assert output.counters == [0, 0]
+    assert output.pose_sender.frame is not None
+    assert output.pose_sender.frame.anchored
+
+
+def test_a_pose_that_was_not_sent_does_not_move_the_frame():
+    output = Output()
+    autopilot = output.pose_sender.autopilot
+    autopilot.attitude = AutopilotAttitude(0.0, 0.0, 0.0, HOST0)
+    autopilot.position = AutopilotPosition(HOST0, np.array([900.0, 50.0, 60.0]), np.zeros(3))
+    output.pose(odom_yaw_rad=None)
+    output.pose(odom_yaw_rad=None, map_number=1, xyz_map_m=np.array([151.0, 2.0, 10.0]), sent=False)
+    output.pose(odom_yaw_rad=None)
+    assert ned_m(output.sent[-1]) == pytest.approx((900.0, -50.0, -60.0), abs=1e-3)
+
+
+def test_axes_without_yaw_that_are_learnt_again_turn_about_the_drone():
+    output = Output(yaw="none")
+    output.pose_sender.autopilot.attitude = AutopilotAttitude(0.0, 0.0, 0.0, HOST0)
+    output.pose(odom_yaw_rad=0.0)
+    output.pose(odom_yaw_rad=math.radians(3.0), resets=1)
+    assert ned_m(output.sent[-1]) == pytest.approx((101.0, -2.0, -10.0), abs=1e-3)
+    output.pose(odom_yaw_rad=math.radians(3.0), resets=1, xyz_map_m=np.array([102.0, 2.0, 10.0]))
+    expected = 101.0 + math.cos(math.radians(3.0)), -2.0 + math.sin(math.radians(3.0)), -10.0
+    assert ned_m(output.sent[-1]) == pytest.approx(expected, abs=1e-3)
+
+
+def test_a_position_that_moves_is_taken_at_the_time_of_the_pose_unless_it_is_old():
+    for age_s, x_m in ((0.5, 902.5), (1.5, 101.0)):
+        output = Output()
+        stamp_ns = HOST0 + 20 * MS - round(1e9 * age_s)
+        velocity_mps = np.array([5.0, 0.0, 0.0])
+        output.pose_sender.autopilot.position = AutopilotPosition(stamp_ns, np.array([900.0, 0.0, 0.0]), velocity_mps)
+        output.pose(odom_yaw_rad=0.0)
+        assert output.sent[0].x == pytest.approx(x_m, abs=1e-3)
 
 
 @pytest.mark.parametrize("age_s", [None, 5.0])

@@ -13,10 +13,11 @@ from links.mavlink.poses.gate import PoseLimits, RejectReason
 from links.mavlink.poses.position_gate import (
     COMPASS_RAD,
     LEVER_M,
-    odom_position,
     position_quality_percent,
     position_reason,
+    sent_position,
 )
+from links.mavlink.poses.sent_frame import SentFrame
 from stages.geometry.frames import rotation_z
 from stages.messages import PoseState, PositionEstimate, RelativePose
 from tests.links.mavlink.mavlink_poses import HOST0, MS, good_pose, position_of
@@ -66,15 +67,14 @@ def test_its_age_is_limited(age_ms: int, why: RejectReason | None):
 def test_the_position_is_turned_into_the_autopilots_axes(yaw_deg: float):
     pose = position(odom_yaw_rad=math.radians(yaw_deg))
     assert isinstance(pose.estimate, PositionEstimate)
-    R_map_odom = rotation_z(math.radians(yaw_deg))
-    given = odom_position(pose)
-    np.testing.assert_allclose(R_map_odom @ given.xyz_odom_m, pose.estimate.xyz_map_m)
-    assert given.xyz_odom_m[2] == pose.estimate.xyz_map_m[2]
+    given = sent_position(pose, SentFrame(math.radians(yaw_deg), np.array([10.0, 20.0, 30.0])))
+    turned_m = rotation_z(math.radians(yaw_deg)) @ (given.xyz_m - [10.0, 20.0, 30.0])
+    np.testing.assert_allclose(turned_m, pose.estimate.xyz_map_m)
 
 
 def test_the_error_of_the_yaw_and_of_the_compass_is_in_the_level_covariance():
     covariance = np.diag([0.01, 0.04, 0.09])
-    given = odom_position(position(covariance, odom_yaw_rad=math.pi / 2, odom_yaw_sigma_rad=0.03))
+    given = sent_position(position(covariance, odom_yaw_sigma_rad=0.03), SentFrame(math.pi / 2, np.zeros(3)))
     level = (0.03**2 + COMPASS_RAD**2) * LEVER_M**2
     np.testing.assert_allclose(given.covariance_m2, np.diag([0.04 + level, 0.01 + level, 0.09]), atol=1e-12)
 
@@ -85,7 +85,7 @@ def test_the_covariance_of_a_pose_is_turned_from_drone_axes():
     pose = good_pose(R_map_drone=R, map_covariance=covariance, odom_yaw_sigma_rad=0.0)
     level = (COMPASS_RAD * LEVER_M) ** 2
     expected = np.diag([0.04 + level, 0.01 + level, 0.09])
-    np.testing.assert_allclose(odom_position(pose).covariance_m2, expected, atol=1e-12)
+    np.testing.assert_allclose(sent_position(pose, SentFrame(0.0, np.zeros(3))).covariance_m2, expected, atol=1e-12)
 
 
 def test_quality_decreases_with_both_sigmas():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import threading
@@ -194,6 +195,11 @@ def test_after_a_kill_with_a_state_file_poses_are_sent_again_within_5_s(
     outcome = json.loads(records[-1].data)
     assert outcome["sent_poses"] > 100
     assert (outcome["wrong_poses"], outcome["sent_worst_m"] < 0.5) == (0, True)
+    own = messages(records, "/autopilot/rx", "LOCAL_POSITION_NED")
+    first, at_first = sent[0][1], next(m for r, m in own if r.arrival_ns >= sent[0][0].arrival_ns)
+    assert math.dist((first.x, first.y, first.z), (at_first.x, at_first.y, at_first.z)) < 1.0
+    steps_m = [math.dist((a.x, a.y, a.z), (b.x, b.y, b.z)) for (_, a), (_, b) in itertools.pairwise(own)]
+    assert max(steps_m) < 2.0  # the switch moves the autopilot's position by the error of its GPS, not to `map`
     if outcome["sent_yaw_worst_deg"] is not None:
         assert outcome["sent_yaw_worst_deg"] < 10.0
         first_ns = sent[0][0].arrival_ns

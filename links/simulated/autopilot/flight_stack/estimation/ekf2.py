@@ -60,6 +60,9 @@ class Ekf2(Ekf3):
             if now - last > PX4_NO_AID_S * NS:
                 self.position_timeout = self.velocity_timeout = True
 
+    def _external_variance_m2(self, external: External) -> float:
+        return external.position_sigma_m**2
+
     def _fuse_yaw(self, external: External | None) -> None:
         super()._fuse_yaw(external if self._started else None)
 

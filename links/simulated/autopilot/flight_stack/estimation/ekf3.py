@@ -1,5 +1,9 @@
 """ArduPilot's EKF3: aiding by position, velocity, height and yaw, with its sources, gates, timeouts and resets.
 
+While a GPS receiver reports an accuracy, that is the noise of every position, also of an external one, whose covariance
+and VISO_POS_M_NSE then do not count (until 4.6). Aiding that begins with an external source resets the height to it,
+whatever the source of the height is.
+
 Not modelled: wind and magnetic field states (the compass is fused as a heading), optical flow, ranges, the GSF yaw
 estimator, ground effect.
 
@@ -31,6 +35,7 @@ from stages.geometry.frames import Array64
 NS = 1_000_000_000
 RECENT_NS = 500_000_000  # minTestTime_ms: a source in use
 FRESH_NS = 250_000_000  # a reset uses data not older than this
+LEAST_POSITION_NOISE_M = 0.5  # EK3_POSNE_M_NSE, of a position with GPS accuracy
 BARO_OFFSET_GAIN, BARO_OFFSET_STEP_M = 0.1, 5.0  # calcFiltBaroOffset, while another height source is used
 
 
@@ -123,6 +128,8 @@ class Ekf3:
                 self._position_pass_ns = self._velocity_pass_ns = now
                 self._reset_velocity(now)
                 self._reset_position(now)
+                if source is AidingSource.EXTERNAL and external is not None:
+                    self.lane.reset(2, external.xyz_m[2:], external.position_sigma_m**2)
             return
         position_aiding = now - self._position_pass_ns <= RECENT_NS
         velocity_aiding = now - self._velocity_pass_ns <= RECENT_NS
@@ -165,8 +172,9 @@ class Ekf3:
             self.lane.fuse_yaw(innovation, variance)
 
     def request_yaw_reset(self) -> None:
-        """AP_AHRS::request_yaw_reset: the next yaw of the source in use is taken over."""
-        self._yaw_source_reset = True
+        """AP_AHRS::request_yaw_reset: the next yaw is taken over, with GPS only: the EKF-GSF needs its velocity."""
+        if self.sources.position is AidingSource.GPS and self.sources.velocity is AidingSource.GPS:
+            self._yaw_source_reset = True
 
     # --- horizontal position and velocity ---
 
@@ -189,7 +197,7 @@ class Ekf3:
                 velocity = gps.velocity_mps
                 climb = fuses_climb(AidingSource.GPS, self.sources, self._sets, self._options)
         elif external is not None and source is AidingSource.EXTERNAL:
-            position, variance = external.xyz_m[:2], external.position_sigma_m**2
+            position, variance = external.xyz_m[:2], self._external_variance_m2(external)
             self.used_external_ns = now
         if (
             external is not None
@@ -213,6 +221,12 @@ class Ekf3:
             self._test_velocity(now, velocity[: 3 if climb else 2], velocity_sigma)
         if position is not None:
             self._test_position(now, position, variance)
+
+    def _external_variance_m2(self, external: External) -> float:
+        """Noise of an external horizontal position (FuseVelPosNED): that of GPS, if there has been a fix."""
+        if self._last_gps is None:
+            return external.position_sigma_m**2
+        return max(self._gps_settings.reported_m, LEAST_POSITION_NOISE_M) ** 2
 
     def _hold_position(self) -> None:
         """AID_NONE: a synthetic position keeps the tilt."""

@@ -28,7 +28,7 @@ class Estimators:
     def __init__(self, settings: FlightStackSettings, yaw_rad: float, seed: int) -> None:
         self._settings = settings
         self._sets = tuple(SOURCE_SETS[name] for name in settings.source_sets)
-        self._px4 = settings.kind == "px4"
+        self.px4 = settings.kind == "px4"
         self._rng = np.random.default_rng([seed, 43])
         imu = settings.imu
         self._other = np.concatenate(  # bias of the second IMU relative to the first
@@ -50,11 +50,11 @@ class Estimators:
         self._resets: list[tuple[Array64, float]] = []
         delay = self._settings.viso_delay_ms
         px4 = Px4Input(ekf2_ev_delay_ms=delay, compass=compass)
-        self.input = px4 if self._px4 else ArduPilotInput(viso_delay_ms=delay)
+        self.input = px4 if self.px4 else ArduPilotInput(viso_delay_ms=delay)
 
     def _core(self, sets: tuple[Sources, ...], yaw_rad: float | None) -> Ekf3:
         s = self._settings
-        cls = Ekf2 if self._px4 else Ekf3
+        cls = Ekf2 if self.px4 else Ekf3
         return cls(sets, s.source_options, s.gps, yaw_rad)
 
     @property
@@ -180,7 +180,7 @@ class Estimators:
             gps=core.sources.position is AidingSource.GPS,
         )
         ratios = s.velocity, s.position, s.height, s.yaw
-        if self._px4:
+        if self.px4:
             return telemetry.estimator_status(device_ns, flags, ratios, core.lane.P)
         return telemetry.ekf_status(flags, ratios)
 

@@ -71,7 +71,7 @@ class FilterRules:
     velocity_retry_s: float
     height_retry_s: float  # hgtRetryTimeMode12_ms
     stop_aiding_s: float  # tiltDriftTimeMax_ms
-    external_height_lost_s: float  # lostExtNavHgt
+    external_height_lost_s: float  # extNavDataIsFresh
     horizon_s: float  # delay of the fusion horizon
 
 
@@ -92,7 +92,7 @@ EKF3 = FilterRules(
     velocity_retry_s=10.0,
     height_retry_s=5.0,
     stop_aiding_s=15.0,
-    external_height_lost_s=2.0,
+    external_height_lost_s=0.5,
     horizon_s=0.24,
 )
 

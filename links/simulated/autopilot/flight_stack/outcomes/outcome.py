@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from flow.link import Record
+from links.mavlink.poses.sent_frame import SentFrame
 from links.simulated.autopilot.flight_stack.outcomes.events import EventKind
 from links.simulated.autopilot.flight_stack.outcomes.sent_poses import SentPoses
 from links.simulated.autopilot.flight_stack.stack import FlightStack
@@ -84,13 +85,13 @@ class FlightOutcome:
         self._last: Array64 | None = None
         self._poses = SentPoses(truth, odometry)
 
-    def on_sent(self, record: Record, axes_yaw_rad: float) -> None:
-        """A frame to the autopilot, whose axes have this yaw in `map` if it is a pose.
+    def on_sent(self, record: Record, frame: SentFrame | None) -> None:
+        """A frame to the autopilot, in this frame if it is a pose.
 
         After a crash none counts: the simulated IMU does not feel the impact.
         """
         if not self._stack.quadrotor.crashed:
-            self._poses.add(record, axes_yaw_rad)
+            self._poses.add(record, frame)
 
     def is_over(self) -> bool:
         """Check the path since the last call for collisions and fly-aways; True: the flight was lost some time ago."""

@@ -2,7 +2,7 @@
 
 Errors of a sent pose are those of ODOMETRY against T_map_vehicle T_vehicle_drone at its time: the first by the
 vehicle's odometry, whose drift the autopilot's frame shares, the second true. Without odometry both are true. They are
-compared in the axes that grd states for what it sends. For statistics only.
+compared in the frame that grd states for what it sends. For statistics only.
 
 Source: ours; 95 % quantiles of chi-squared with 3 and 1 degrees of freedom.
 """
@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 
 from flow.link import Record
 from links.mavlink.ned_frd import R_odom_drone_from_wxyz, flip_yz
+from links.mavlink.poses.sent_frame import SentFrame
 from links.mavlink.transport.framing import parse_frame
 from links.simulated.sensors.vehicle_odometry import VehicleOdometry
 from links.simulated.world.scene import Truth
-from stages.geometry.frames import Array64, rotation_z
+from stages.geometry.frames import Array64
 
 WRONG_M, WRONG_DEG = 1.0, 10.0  # a sent pose with a larger error is wrong
 NO_YAW_RAD2 = 9.0  # a larger yaw variance: the message holds no yaw
@@ -46,7 +47,7 @@ class _SentPose:
     sent_ns: int
     xyz_m: Array64  # z up
     yaw_rad: float  # NaN: without yaw
-    axes_yaw_rad: float  # in map, of the axes of xyz_m and yaw_rad
+    frame: SentFrame  # of xyz_m and yaw_rad
     covariance_m2: Array64  # (3, 3), axes of xyz_m
     yaw_variance: float
 
@@ -61,11 +62,12 @@ class SentPoses:
     def __len__(self) -> int:
         return len(self._poses)
 
-    def add(self, record: Record, axes_yaw_rad: float) -> None:
-        """A frame to the autopilot. axes_yaw_rad: yaw in map of the axes of a pose."""
+    def add(self, record: Record, frame: SentFrame | None) -> None:
+        """A frame to the autopilot. `frame`: that of a pose."""
         message: Any = parse_frame(record.data)
         if message.get_type() != "ODOMETRY":
             return
+        assert frame is not None
         upper = np.array(message.pose_covariance)
         has_yaw = all(map(math.isfinite, message.q)) and not upper[YAW_VARIANCE] > NO_YAW_RAD2
         R = R_odom_drone_from_wxyz(message.q) if has_yaw else np.full((3, 3), np.nan)
@@ -79,7 +81,7 @@ class SentPoses:
                 sent_ns=record.arrival_ns,
                 xyz_m=flip_yz(np.array([message.x, message.y, message.z])),
                 yaw_rad=math.atan2(R[1, 0], R[0, 0]),
-                axes_yaw_rad=axes_yaw_rad,
+                frame=frame,
                 covariance_m2=position,
                 yaw_variance=float(upper[YAW_VARIANCE]),
             )
@@ -102,12 +104,11 @@ class SentPoses:
         R_map, t_map = self._map_vehicle(stamps)
         expected_m = t_map + np.einsum("nij,nj->ni", R_map, relative_m)
         R_expected = R_map @ np.swapaxes(R_vehicle, 1, 2) @ R_drone
-        axes_yaw = np.array([pose.axes_yaw_rad for pose in poses])
+        axes_yaw = np.array([pose.frame.yaw_rad for pose in poses])
         yaw = np.arctan2(R_expected[:, 1, 0], R_expected[:, 0, 0]) - axes_yaw
         sent_yaw = np.array([pose.yaw_rad for pose in poses])
         without = np.isnan(sent_yaw)
-        R_axes_map = np.array([rotation_z(-yaw_rad) for yaw_rad in axes_yaw.tolist()])
-        expected_m = np.einsum("nij,nj->ni", R_axes_map, expected_m)
+        expected_m = np.array([pose.frame.position(xyz_m) for pose, xyz_m in zip(poses, expected_m, strict=True)])
         error_m = np.array([pose.xyz_m for pose in poses]) - expected_m
         covariances = np.array([pose.covariance_m2 for pose in poses])
         distance2 = np.einsum("ni,ni->n", error_m, np.linalg.solve(covariances, error_m[:, :, None])[:, :, 0])

@@ -25,7 +25,7 @@ def test_raw_imu_holds_integers_in_mg_and_mrad_per_s_of_frd_axes() -> None:
     message = telemetry.raw_imu(5_000_000, sample, np.array([24.0, 10.0, -41.6]))
     assert (message.xmag, message.ymag, message.zmag) == (240, -100, 416)  # mgauss
     assert (message.xgyro, message.ygyro, message.zgyro) == (100, -200, 300)
-    assert (message.xacc, message.yacc, message.zacc) == (102, 204, -1000)  # 9.81 m/s^2 over 9.80665, in mg
+    assert (message.xacc, message.yacc, message.zacc) == (101, 203, -1000)  # 9.81 m/s^2 over 9.80665, in mg, truncated
     assert message.time_usec == 5000
     assert telemetry.raw_imu(0, sample * 1e4, np.zeros(3)).zacc == -32767
 

@@ -9,12 +9,15 @@ import pytest
 
 from flow.link import Record
 from links.mavlink.ned_frd import R_odom_drone_from_wxyz, wxyz_from_R_odom_drone
+from links.mavlink.poses.sent_frame import SentFrame
 from links.simulated.autopilot.flight_stack.outcomes.outcome import FlightOutcome
 from links.simulated.sensors.vehicle_odometry import VehicleOdometry, VehicleOdometrySettings
 from links.simulated.world.mesh import RayScene, box
 from links.simulated.world.scene import Truth
 from stages.geometry.frames import rotation_z
 from tests.links.simulated.autopilot.flight_stack.sent_truth import PARKED, START_NS, Host
+
+MAP = SentFrame(0.0, np.zeros(3))
 
 
 def watched(host: Host, world: RayScene | None = None, odometry: VehicleOdometry | None = None) -> FlightOutcome:
@@ -35,7 +38,7 @@ def sent(host: Host, outcome: FlightOutcome, shift_m: float = 0.0, yaw_deg: floa
     host.edit = change
     now_ns = START_NS + host.ticks * 10_000_000
     frame = bytes(host.pose(now_ns).pack(host._mav))
-    outcome.on_sent(Record("/autopilot/tx", now_ns, now_ns, frame), 0.0)
+    outcome.on_sent(Record("/autopilot/tx", now_ns, now_ns, frame), MAP)
 
 
 @pytest.mark.parametrize(("shift_m", "yaw_deg", "wrong"), [(0.0, 0.0, 0), (1.5, 0.0, 1), (0.0, 15.0, 1), (0.7, 8.0, 0)])
@@ -58,7 +61,7 @@ def test_a_pose_of_a_time_that_was_not_flown_does_not_count() -> None:
     before = outcome.result()
     host.edit = lambda message, time_s: setattr(message, "time_usec", message.time_usec + 400_000)
     now_ns = START_NS + host.ticks * 10_000_000
-    outcome.on_sent(Record("/autopilot/tx", now_ns, now_ns, bytes(host.pose(now_ns).pack(host._mav))), 0.0)
+    outcome.on_sent(Record("/autopilot/tx", now_ns, now_ns, bytes(host.pose(now_ns).pack(host._mav))), MAP)
     assert outcome.result() == before
 
 
@@ -89,7 +92,7 @@ def test_the_share_inside_is_that_of_the_covariance_in_the_message(
 
 @pytest.mark.parametrize("has_yaw", [True, False])
 @pytest.mark.parametrize(("stated_deg", "error_m"), [(30.0, 0.0), (0.0, 3.4)])
-def test_a_pose_is_compared_in_the_axes_that_grd_states(has_yaw: bool, stated_deg: float, error_m: float) -> None:
+def test_a_pose_is_compared_in_the_frame_that_grd_states(has_yaw: bool, stated_deg: float, error_m: float) -> None:
     """The drone is 6 to 7 m from the origin: 30 deg move it by 3.1 to 3.6 m."""
     host = Host(3.0)
     outcome = watched(host)
@@ -98,14 +101,14 @@ def test_a_pose_is_compared_in_the_axes_that_grd_states(has_yaw: bool, stated_de
     def change(message, time_s: float) -> None:
         R = rotation_z(math.radians(-30.0))
         x, y, _ = R @ [message.x, -message.y, 0.0]
-        message.x, message.y = float(x), float(-y)
+        message.x, message.y = float(x) + 40.0, float(-y)
         turned = wxyz_from_R_odom_drone(R @ R_odom_drone_from_wxyz(message.q))
         message.q = turned if has_yaw else [math.nan] * 4
 
     host.edit = change
     now_ns = START_NS + host.ticks * 10_000_000
     frame = Record("/autopilot/tx", now_ns, now_ns, bytes(host.pose(now_ns).pack(host._mav)))
-    outcome.on_sent(frame, math.radians(stated_deg))
+    outcome.on_sent(frame, SentFrame(math.radians(stated_deg), np.array([40.0, 0.0, 0.0])))
     result = outcome.result()
     assert result.sent_worst_m == pytest.approx(error_m, abs=0.4)
     assert result.sent_yaw_rms_deg == (pytest.approx(30.0 - stated_deg, abs=1.0) if has_yaw else None)

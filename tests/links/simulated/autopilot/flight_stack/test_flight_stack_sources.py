@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+from links.mavlink.poses.sent_frame import SentFrame
 from links.simulated.autopilot.rules import PoseResult
 from tests.links.simulated.autopilot.flight_stack.sent_truth import TO_EXTERNAL, Host
 
@@ -34,7 +35,7 @@ def test_after_the_switch_it_hovers_on_what_it_is_sent(kind: str, sets: str) -> 
 def test_a_plan_on_external_poses_is_flown_in_the_axes_that_grd_states(stated: bool) -> None:
     """`Host` sends in the axes of map; without a statement they are taken as axes that point north, 57 deg off."""
     host = Host(16.0, plan=[*TO_EXTERNAL[:2], {"do": "go_to", "xyz_m": [11.0, 0.0, 10.0], "for_s": 12}])
-    host.stack.axes_yaw_rad = 0.0 if stated else None
+    host.stack.sent_frame = SentFrame(0.0, np.zeros(3)) if stated else None
     host.run(16.0)
     away_m = float(np.linalg.norm(host.stack.quadrotor.state[0:3] - [11.0, 0.0, 10.0]))
     assert (away_m < 0.7) == stated
@@ -62,7 +63,7 @@ def test_px4_takes_positions_without_rotation_only_with_a_compass(sets: list[str
 
 def test_a_wrong_position_moves_the_drone_the_other_way() -> None:
     """A position that is 1 m too far forward from 8 s on moves the drone back by 1 m."""
-    host = Host(20.0)
+    host = Host(45.0)
 
     def shift(message, time_s: float) -> None:
         message.x += min(max(time_s - 8.0, 0.0) / 4.0, 1.0)
@@ -70,7 +71,7 @@ def test_a_wrong_position_moves_the_drone_the_other_way() -> None:
     host.edit = shift
     host.run(8.0)
     before = host.stack.quadrotor.state[0]
-    host.run(20.0)
+    host.run(45.0)
     assert host.stack.quadrotor.state[0] - before == pytest.approx(-1.0, abs=0.25)
 
 

@@ -298,7 +298,7 @@ def version_check(name: str, profile: Profile, version: tuple[int, int, int] | N
     """Whether grd supports the firmware."""
     name, least = f"{name} firmware", ".".join(map(str, profile.least_version))
     if version is None:
-        return warning(name, f"it did not answer a request of its version; {profile.name} {least} or later is needed")
+        return warning(name, f"its version was not received: check that it is {profile.name} {least} or later")
     text = f"{profile.name} {'.'.join(map(str, version))}"
     if version[:2] < profile.least_version:
         return fail(name, f"{text}: {least} or later is needed: {profile.least_version_why}")

@@ -20,7 +20,7 @@ ArduPilot (4.6; EKF3)
   0.5 m gives 0.57 m), and never below VISO_POS_M_NSE and VISO_YAW_M_NSE.
 - With a GPS receiver it uses neither for the horizontal position, but the accuracy that GPS reports, at least
   EK3_POSNE_M_NSE (0.5 m), also with the source set of grd, and up to 4.6 at least: where GPS is bad, poses of grd weigh
-  little. At 3 m the position follows them over 3.5 s, and an error of 1 m/s^2 of acceleration moves it by 12 m.
+  little. Calculated for 3 m: the position follows them over 3.5 s, and an error of 1 m/s^2 moves it by 12 m.
 - Aiding that begins with grd (set 1 without position) sets the height to grd's, even if it comes from the barometer.
 - Position times out 7 s after the last fused pose; the EKF failsafe lands 1 s later. Until then it says nothing.
 - time_usec is converted by the fastest message (JitterCorrection): a constant delay is not corrected. For grd it is
@@ -258,7 +258,7 @@ def _px4(yaw: YawOutput) -> tuple[RequiredParameter, ...]:
         RequiredParameter("EKF2_HGT_REF", (0.0, 3.0, 1.0), why="height from the barometer, grd or GPS"),
         RequiredParameter("EKF2_EV_NOISE_MD", (0.0,), why="use the message's covariance"),
         RequiredParameter(
-            "EKF2_EV_DELAY", at_least=0.0, at_most=20.0, why="poses have the time of sending, by TIMESYNC on its clock"
+            "EKF2_EV_DELAY", at_least=0.0, at_most=20.0, why="TIMESYNC already removes the delay of the link"
         ),
         RequiredParameter("EKF2_EVP_NOISE", at_least=0.01, at_most=0.3, why="minimum position sigma"),
         RequiredParameter("EKF2_EV_QMIN", at_least=0.0, at_most=50.0, why="quality is 1 at grd's limits, 100 at best"),

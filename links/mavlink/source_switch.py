@@ -165,7 +165,7 @@ class SourceSwitch:
         if self._step_m is not None:
             limit_m -= HYSTERESIS_M
         elif step_m > limit_m and self.active != self._set:
-            self._warn(f"no source switch: it would be {step_m:.0f} m")
+            self._warn(f"no source switch: position would move {step_m:.0f} m")
         self._step_m = step_m if step_m > limit_m else None
 
     def due(self, now_ns: int) -> Any | None:

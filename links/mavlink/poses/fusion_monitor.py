@@ -53,9 +53,11 @@ class FusionMonitor:
 
     def add(self, message: Any, sending: bool, now_ns: int) -> tuple[str, bool] | None:
         """Add a status message. (text, whether to change the reset counter) when a rejection begins."""
+        if message.get_type() not in STATUSES:
+            return None
         ratio = _ratio(message)
         if ratio is None or (math.isnan(ratio) and not self.stopped):
-            self._above_ns = None if message.get_type() in STATUSES else self._above_ns
+            self._above_ns = None
             return None
         if self._newest_ns is None or now_ns - self._newest_ns > MAX_STATUS_GAP_NS:
             self._above_ns = self._below_ns = None
@@ -86,10 +88,8 @@ class FusionMonitor:
 
 
 def _ratio(message: Any) -> float | None:
-    """Test ratio of the horizontal position, 1 at the gate; NaN: nothing is fused; None: no such message, or of GPS."""
-    kind = message.get_type()
-    if kind == "EKF_STATUS_REPORT":
+    """Test ratio of the horizontal position, 1 at the gate; NaN: nothing is fused; None: it is that of GPS."""
+    if message.get_type() == "EKF_STATUS_REPORT":
         return float(message.pos_horiz_variance)
-    if kind == "ESTIMATOR_STATUS" and not (message.flags & GPS_GLITCH and message.pos_horiz_ratio > 1):
-        return float(message.pos_horiz_ratio)
-    return None
+    ratio = float(message.pos_horiz_ratio)
+    return None if message.flags & GPS_GLITCH and ratio > 1 else ratio

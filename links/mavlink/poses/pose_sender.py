@@ -6,8 +6,8 @@
     measured  a pose with yaw, while cameras or the raw IMU measure it; its yaw comes from grd alone. The axes are
               parallel to the autopilot's own when the first pose since its boot is sent, by its motion if that shows
               them to 2 deg, else by its attitude; without an attitude they are those of `map`. They are kept while
-              `map` is the same
-              After a restart in flight the attitude contains earlier poses: it chooses the axes, and measures nothing
+              `map` is the same. After a restart in flight the attitude contains earlier poses: it chooses the axes, and
+              measures nothing
 
 Both are in the frame of the autopilot's own position at the first pose (`SentFrame`). After a restart in flight that
 position has drifted meanwhile, and the frame begins there.
@@ -39,7 +39,7 @@ from links.mavlink.poses.odom_frame import odom_yaw_rad
 from links.mavlink.poses.pose_messages import landing_target, odometry, vision_position_estimate
 from links.mavlink.poses.position_gate import gate_reason
 from links.mavlink.poses.position_messages import position_odometry, position_vision_estimate
-from links.mavlink.poses.sent_frame import ECHO_M, FAR_M, TURNED_RAD, SentFrame
+from links.mavlink.poses.sent_frame import ECHO_M, FAR_M, SentFrame
 from links.mavlink.poses.status_texts import StatusTexts
 from links.mavlink.profiles import ProfileName, YawOutput
 from links.mavlink.transport.framing import SEQUENCE
@@ -85,7 +85,7 @@ class PoseSender:
         self._limits = limits
         self._yaw: YawOutput = yaw
         self._profile: ProfileName = profile
-        self._poses_sent = self._yaw_reset = False  # since the autopilot's boot
+        self._yaw_reset = False  # since the first pose
         self._odom_yaw_rad: float | None = None  # of the newest pose that had one
         self._axes_pose: RelativePose | None = None  # first pose sent without yaw since the estimate last jumped
         self._other_boot_rad: float | None = None  # yaw of its axes before its newest boot: not valid any more
@@ -113,7 +113,7 @@ class PoseSender:
     def turn_rad(self, pose: RelativePose) -> float | None:
         """Angle of the axes of a sent pose against the autopilot's own [rad]; None: not known."""
         own_yaw_rad = self._odom_axes_yaw_rad(self.with_axes(pose))
-        return None if own_yaw_rad is None else (0.0 if self.frame is None else self.frame.yaw_rad) - own_yaw_rad
+        return None if own_yaw_rad is None or self.frame is None else self.frame.yaw_rad - own_yaw_rad
 
     def with_axes(self, pose: RelativePose) -> RelativePose:
         """A pose with the axes of the first one that was sent, until the estimate jumps: positions must not turn."""
@@ -145,11 +145,11 @@ class PoseSender:
 
     def on_yaw_reset(self) -> None:
         """The autopilot has reset its yaw. Once its telemetry contains our poses, its axes are then unknown."""
-        self._yaw_reset = self._yaw_reset or self._poses_sent
+        self._yaw_reset = self._yaw_reset or self.frame is not None
 
     def on_boot(self) -> None:
         """The autopilot has booted: its axes are others, and their yaw has to be learnt again before a pose is sent."""
-        self._poses_sent = self._yaw_reset = False
+        self._yaw_reset = False
         self._other_boot_rad, self.frame, self._axes_pose = self._odom_yaw_rad, None, None
         self.fusion.on_boot()
 
@@ -170,7 +170,7 @@ class PoseSender:
         if not self.sends_yaw and (self._axes_pose is None or _estimate_of(pose) != _estimate_of(self._axes_pose)):
             self._axes_pose = pose
         self._sent = SentPose(now_ns, pose.stamp_ns, pose.resets, pose.track_id)
-        self._incremented, self._poses_sent, self.frame = False, True, self._next_frame
+        self._incremented, self.frame = False, self._next_frame
         if not self._sending:
             self._sending = True
             self.texts.on_sending(now_ns)
@@ -225,7 +225,7 @@ class PoseSender:
 
     def _is_other(self, frame: SentFrame, xyz_map_m: Array64, own_m: Array64, own_yaw_rad: float) -> bool:
         """Whether `map` is another one than that of the frame, by the autopilot's own position (3,) and axes."""
-        if self.sends_yaw and abs(math.remainder(frame.yaw_rad - own_yaw_rad, math.tau)) > TURNED_RAD:
+        if self.sends_yaw and abs(math.remainder(frame.yaw_rad - own_yaw_rad, math.tau)) > WRONG_COMPASS_RAD:
             return True
         return float(np.linalg.norm(frame.position(xyz_map_m) - own_m)) > FAR_M
 

@@ -9,7 +9,9 @@ ground. The frame stays while `map` does, so that the drone returns to its place
     at the autopilot's boot
     with the autopilot's first position, if it had none before: until then the origin is that of `map`
     where `map` has begun again, if the pose is then more than FAR_M from the autopilot's own position, or its axes are
-    turned by more than TURNED_RAD: it is another one
+    turned by more than WRONG_COMPASS_RAD: it is another one
+
+The autopilot's position may contain poses of before. It chooses the frame, and measures nothing.
 
 Without yaw the axes may be learnt again where the pose jumps; they turn about the drone.
 
@@ -20,14 +22,12 @@ vision when GPS stops), FlightTaskAuto.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 from stages.geometry.frames import Array64, rotation_z
 
 FAR_M = 10.0  # from the autopilot's own position: more than that drifts while the vehicle's motion is unknown (assumed)
 ECHO_M = 3.0  # an own position that comes later and is nearer may be our own poses, late (assumed)
-TURNED_RAD = math.radians(30.0)  # of the axes against the autopilot's: more than the error of a compass (assumed)
 
 
 @dataclass(frozen=True, slots=True)

@@ -186,7 +186,7 @@ def test_parameters_are_compared_with_the_profile(profile):
     [
         (ARDUPILOT, (4, 6, 3), Level.OK, "ardupilot 4.6.3"),
         (ARDUPILOT, (4, 5, 7), Level.FAIL, "ardupilot 4.5.7: 4.6 or later is needed: earlier ones reset"),
-        (ARDUPILOT, None, Level.WARNING, "did not answer"),
+        (ARDUPILOT, None, Level.WARNING, "check that it is ardupilot 4.6"),
         (PX4, (1, 16, 0), Level.OK, "px4 1.16.0"),
         (PX4, (1, 13, 3), Level.FAIL, "1.14 or later is needed"),
     ],

@@ -125,10 +125,24 @@ def test_no_switch_is_requested_that_would_move_the_position_far():
     flight.shift_m = np.array([12.0, 0.0, 0.0])
     flight.fly(20.0)
     assert flight.requested == []
-    assert flight.texts == ["no source switch: it would be 12 m"]
+    assert flight.texts == ["no source switch: position would move 12 m"]
     assert "the position would move by 12 m" in str(flight.switch.status)
     flight.flags, flight.autopilot.position = NO_POSITION, None  # its GPS is lost: there is no position to move
     flight.fly(20.0)
+    assert flight.requested == [2]
+
+
+def test_a_step_near_the_limit_is_reported_once():
+    flight = Flight()
+    flight.shift_m = np.array([10.1, 0.0, 0.0])
+    flight.fly(1.0)
+    assert flight.frame is not None
+    for x_m in (-0.2, 0.2, -0.2, 0.2):
+        flight.frame = dataclasses.replace(flight.frame, offset_m=flight.frame.offset_m + np.array([x_m, 0.0, 0.0]))
+        flight.fly(1.0)
+    assert flight.texts == ["no source switch: position would move 10 m"]
+    flight.frame = dataclasses.replace(flight.frame, offset_m=flight.frame.offset_m - np.array([3.0, 0.0, 0.0]))
+    flight.fly(15.0)
     assert flight.requested == [2]
 
 

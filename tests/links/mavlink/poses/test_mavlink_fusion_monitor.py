@@ -134,3 +134,10 @@ def test_an_infinite_ratio_is_a_rejection():
     flight = Flight()
     assert flight.fly(2.0, math.inf, estimator_status) < 50
     assert flight.fly(5.0, math.inf, estimator_status) == 0
+
+
+def test_a_ratio_that_is_interrupted_by_that_of_gps_is_no_rejection():
+    flight = Flight()
+    for _ in range(5):
+        assert flight.fly(0.4, 1.4, estimator_status) == 20
+        assert flight.fly(0.2, 1.4, gps_glitch) == 10

@@ -23,6 +23,7 @@ from flow.link import Link, Tap
 from flow.stage import Node, PortError, Stage, input_ports, output_ports
 
 KINDS: dict[str, type[Node[Any]]] = {"stages": Stage, "links": Link}
+EXTRAS = {"sklearn": "baseline", "stonesoup": "baseline"}  # libraries that a class imports, by extra of pyproject.toml
 PACKAGES = {"stages": "stages", "links": "links"}  # packages whose classes are suggested, by kind
 
 
@@ -44,7 +45,9 @@ def named_class(tree: Tree, kind: str, path: KeyPath, use: Any) -> type[Node[Any
     try:
         module = importlib.import_module(module_name)
     except ImportError as error:
-        tree.error(here, f"'{module_name}' cannot be imported: {error}.")
+        extra = EXTRAS.get((error.name or "").partition(".")[0])
+        how = f": pip install -e '.[{extra}]'" if extra else "."
+        tree.error(here, f"'{module_name}' cannot be imported: {error}{how}")
         return None
     cls: Any = getattr(module, class_name, None)
     if cls is None:

@@ -9,6 +9,8 @@ import difflib
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+from flow.config.secrets import without_secrets
+
 
 @dataclass(frozen=True, slots=True)
 class Location:
@@ -23,14 +25,15 @@ class Location:
 
 @dataclass(frozen=True, slots=True)
 class ErrorDetail:
-    """One error: where, in which setting, what is wrong and what to do."""
+    """One error: where, in which setting, what is wrong and what to do. Its text has no secrets."""
 
     location: Location
     path: str  # stages.track.inputs.sweep
     text: str
 
     def __str__(self) -> str:
-        return f"{self.location}: {self.path}: {self.text}" if self.path else f"{self.location}: {self.text}"
+        parts = (str(self.location), self.path, self.text)
+        return without_secrets(": ".join(part for part in parts if part))
 
 
 class ConfigError(Exception):

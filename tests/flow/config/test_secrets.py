@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from flow.config.secrets import without_secrets
+from flow.config_error import ConfigError
 from flow.graph import load_graph
 from links.recording import RecordingReader
 from tests import command
@@ -48,6 +49,15 @@ def test_the_graph_itself_keeps_the_password_it_needs(tmp_path):
     graph = load_graph(tmp_path / "x.yaml")
     assert PASSWORD in graph.nodes["camera"].config["source"]
     assert PASSWORD not in graph.settings_yaml()
+
+
+@pytest.mark.parametrize("setting", ["camera.sourc=rtsp://crew:{}@host/x", "camera.source=[rtsp://crew:{}@host/x]"])
+def test_an_error_in_the_configuration_does_not_show_the_password(tmp_path, setting):
+    (tmp_path / "x.yaml").write_text(CONFIG)
+    with pytest.raises(ConfigError) as caught:
+        load_graph(tmp_path / "x.yaml", sets=[setting.format(PASSWORD)])
+    assert PASSWORD not in str(caught.value)
+    assert "rtsp://***@host/x" in str(caught.value)
 
 
 def test_no_file_of_a_live_run_holds_the_camera_s_password(tmp_path, monkeypatch):

@@ -23,12 +23,14 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from pydantic import BaseModel
 
 from flow.config.classes import KINDS
 from flow.config.edge import Edge, read_edges
-from flow.config.node_spec import NodeSpec, read_nodes
+from flow.config.node_spec import NodeSpec, read_nodes, rig_failed
 from flow.config.secrets import values_without_secrets
-from flow.config.tree import Section, Tree, load_tree
+from flow.config.setting_errors import check_values
+from flow.config.tree import Section, Tree, load_tree, resolve
 from flow.config_error import ConfigError, did_you_mean, one_of
 from flow.link import RUN_TOPICS, TRUTH_TOPICS, Source
 from flow.message import Message
@@ -107,13 +109,17 @@ def load_graph(
     sections: Mapping[str, Section] | None = None,
     *,
     packages: Collection[str] | None = None,
+    rig: type[BaseModel] | None = None,
 ) -> Graph:
     """Read, merge and check a configuration; arguments as in `load_tree`. ConfigError: all errors that it has.
 
     `packages`: top-level packages from which it may name classes; None: any, the configuration is the user's own.
+    `rig`: the model of the `rig` section; None: it may contain anything.
     """
     tree = load_tree(file, overlays, sets, sections)
     tree.packages = packages
+    if rig is not None and "rig" in tree.values and not rig_failed(tree):
+        check_values(tree, ("rig",), rig, resolve(tree, ("rig",), tree.values["rig"]), "rig")
     graph = check(tree, file)
     if tree.errors:
         raise ConfigError.in_order(tree.errors)

@@ -6,13 +6,12 @@ Source: ours.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, cast
 
-from pydantic import ValidationError
-
 from flow.config.classes import named_class
+from flow.config.setting_errors import check_values
 from flow.config.tree import KeyPath, Tree, resolve
 from flow.config_error import did_you_mean, one_of
 from flow.stage import Node
@@ -22,6 +21,7 @@ NODE_KEYS = {
     "links": ("use", "config", "inputs", "needs", "thread"),
 }
 _NAME = re.compile(r"[a-z][a-z0-9_]*\Z")
+_OF_RIG = re.compile(r"\$rig\b")
 NEEDED = r"^\$[^\s$]+$"  # a reference without a default
 
 
@@ -57,10 +57,7 @@ def read_nodes(tree: Tree, kind: str, left_out: dict[str, str]) -> Iterator[Node
         if unmet := _unmet(tree, path, declared):
             left_out[name] = unmet
         elif cls is not None:
-            before = len(tree.errors)
-            config = resolve(tree, (*path, "config"), declared.get("config") or {})
-            if len(tree.errors) == before:  # a reference to nothing is an error already
-                config = _settings(tree, path, cls, config)
+            config = _config(tree, (*path, "config"), cls, declared.get("config") or {})
             yield NodeSpec(name, kind, declared["use"], cls, config, thread, process, low_priority)
 
 
@@ -84,6 +81,30 @@ def _declared(tree: Tree, kind: str) -> Iterator[tuple[str, dict[str, Any]]]:
             yield name, cast("dict[str, Any]", declared)
 
 
+def _config(tree: Tree, path: KeyPath, cls: type[Node[Any]], declared: Any) -> dict[str, Any]:
+    """The settings of a node, checked; as declared where they take a value of a rig that has errors."""
+    config = declared
+    if not (rig_failed(tree) and _takes_rig(declared)):
+        before = len(tree.errors)
+        config = resolve(tree, path, declared)
+        if len(tree.errors) == before:  # a reference to nothing is an error already
+            check_values(tree, path, cls.settings_type, config, cls.__name__)
+    return cast("dict[str, Any]", config) if isinstance(config, dict) else {}
+
+
+def _takes_rig(declared: Any) -> bool:
+    """Whether settings refer to the rig."""
+    if isinstance(declared, dict | list):
+        inner = declared.values() if isinstance(declared, dict) else declared
+        return any(_takes_rig(value) for value in cast("Iterable[Any]", inner))
+    return isinstance(declared, str) and bool(_OF_RIG.match(declared))
+
+
+def rig_failed(tree: Tree) -> bool:
+    """Whether the `rig` section has errors: then those of what takes its values are consequences."""
+    return any(error.path.partition(".")[0] == "rig" for error in tree.errors)
+
+
 def _unmet(tree: Tree, path: KeyPath, declared: dict[str, Any]) -> str:
     """What a node `needs:` and the configuration does not have; empty when it needs nothing, or has it."""
     needs: Any = declared.get("needs")
@@ -91,6 +112,8 @@ def _unmet(tree: Tree, path: KeyPath, declared: dict[str, Any]) -> str:
         return ""
     if not (isinstance(needs, str) and re.fullmatch(NEEDED, needs)):
         tree.error((*path, "needs"), f"must name a value of the configuration, as $rig.cameras, got {needs!r}.")
+        return ""
+    if rig_failed(tree) and _takes_rig(needs):
         return ""
     return needs if resolve(tree, (*path, "needs"), f"{needs} or null") is None else ""
 
@@ -128,32 +151,3 @@ def _low_priority(tree: Tree, path: KeyPath, declared: dict[str, Any]) -> bool:
     if not isinstance(low_priority, bool):
         tree.error((*path, "low_priority"), f"must be true or false, got {low_priority!r}.")
     return low_priority is True
-
-
-def _settings(tree: Tree, path: KeyPath, cls: type[Node], config: Any) -> dict[str, Any]:
-    here = (*path, "config")
-    if not isinstance(config, dict):
-        tree.error(here, "must be a mapping of settings.")
-        return {}
-    settings = cast("dict[str, Any]", config)
-    try:
-        cls.settings_type.model_validate(settings)
-    except ValidationError as errors:
-        for error in errors.errors(include_url=False):
-            where = (*here, *(str(part) for part in error["loc"]))
-            known = cls.settings_type.model_fields if len(error["loc"]) == 1 else ()
-            tree.error(where, _setting_error(error, cls.__name__, known))
-    return settings
-
-
-def _setting_error(error: Any, class_name: str, known: Any) -> str:
-    """The text of a pydantic error, for people."""
-    name = str(error["loc"][-1]) if error["loc"] else ""
-    if error["type"] == "extra_forbidden":
-        has = f" {class_name} has {one_of(known)}." if known else ""
-        return f"unknown setting '{name}'.{did_you_mean(name, known) or has}"
-    if error["type"] == "missing":
-        return "is missing and has no default."
-    text = str(error["msg"]).removeprefix("Value error, ").removeprefix("Input should be ").removesuffix(".")
-    text = text if error["type"] == "value_error" else f"must be {text}"
-    return f"{text}, got {error['input']!r}." if not isinstance(error["input"], dict) else f"{text}."

@@ -10,6 +10,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from pydantic import BaseModel
+
 from flow.config.classes import KINDS, known_classes
 from flow.config.edge import MAX_DEADLINE_MS, MAX_DEPTH, POLICIES
 from flow.config.node_spec import NEEDED
@@ -64,9 +66,13 @@ _NEEDS = {
 _OF_STAGES = {"process": _PROCESS, "low_priority": _LOW_PRIORITY}
 
 
-def schema() -> dict[str, Any]:
-    """The schema of a configuration file with all classes of `known_classes` in flow/config/classes.py."""
+def schema(rig: type[BaseModel]) -> dict[str, Any]:
+    """The schema of a configuration file with all classes of `known_classes` in flow/config/classes.py.
+
+    `rig`: the model of the `rig` section.
+    """
     definitions: dict[str, Any] = {"edge": _ANY_EDGE}
+    rig_section = {**_model(rig, definitions), "description": "values that settings refer to as $rig.name"}
     sections = {kind: _section(kind, definitions) for kind in KINDS}
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
@@ -79,7 +85,7 @@ def schema() -> dict[str, Any]:
                 "anyOf": [*_INCLUDES, {"type": "array", "items": {"anyOf": _INCLUDES}}],
             },
             TOP_LEVEL[1]: {"description": "the recording to replay, relative to this file", "type": "string"},
-            TOP_LEVEL[2]: {"description": "values that settings refer to as $rig.name", "type": "object"},
+            TOP_LEVEL[2]: rig_section,
             **sections,
         },
         "$defs": definitions,
@@ -110,17 +116,23 @@ def _section(kind: str, definitions: dict[str, Any]) -> dict[str, Any]:
 
 
 def _node(cls: type[Node], definitions: dict[str, Any]) -> dict[str, Any]:
-    settings = cls.settings_type.model_json_schema(ref_template="#/$defs/{model}")
-    definitions.update({name: _settings(part) for name, part in settings.pop("$defs", {}).items()})
+    settings = _model(cls.settings_type, definitions)
     inputs = {port: {**_EDGE, "description": f"takes {message.__name__}"} for port, message in input_ports(cls).items()}
     gives = ", ".join(output_ports(cls)) or "nothing"
     return {
         "description": f"{(cls.__doc__ or '').strip().splitlines()[0]} Gives {gives}.",
         "properties": {
-            "config": _settings(settings),
+            "config": settings,
             "inputs": {"type": "object", "additionalProperties": False, "properties": inputs},
         },
     }
+
+
+def _model(model: type[BaseModel], definitions: dict[str, Any]) -> dict[str, Any]:
+    """The schema of a pydantic model; those of the models in it go to `definitions`."""
+    found = model.model_json_schema(ref_template="#/$defs/{model}")
+    definitions.update({name: _settings(part) for name, part in found.pop("$defs", {}).items()})
+    return _settings(found)
 
 
 def _settings(model: dict[str, Any]) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 - `include:` composes files: included files come first, the including file on top. A file is looked for next to the
   including one, then among those that come with the program.
 - An include may take some stages and links of a file alone, under other names: see `_copied`.
-- Overlay files and `--set track.radius_m=0.8` change values.
+- Overlay files and `--set detect.accept_probability=0.9` change values.
 - `$rig.lidar.mount` is replaced by another value of the tree. `$rig.cameras.drone.readout_ms or 0` is 0 where the tree
   has no such value.
 
@@ -35,6 +35,7 @@ from flow.config_error import ConfigError, ErrorDetail, Location, did_you_mean
 
 SHIPPED = Path(__file__).resolve().parents[2] / "configs"  # the configurations that come with the program
 COPY_FORM = "{file: ..., nodes: [...], suffix: ...}"
+SET_FORMS = (("KEY", "autopilot.imu_hz=25"), ("NAME.SETTING", "detect.accept_probability=0.9"))  # scenario, graph
 Section = tuple[str, str]  # YAML text, and where it is from, for errors
 
 
@@ -55,6 +56,12 @@ class Tree:
             path = path[:-1]
         return self.locations.get(path, self.root)
 
+    def last_location(self, path: KeyPath) -> Location:
+        """Where the mapping at `path` was written, or the file or option that changed it last."""
+        first = self.location(path)
+        *_, last = (first, *(at for key, at in self.locations.items() if key[: len(path)] == path))
+        return first if last.file == first.file else last
+
     def error(self, path: KeyPath, text: str, location: Location | None = None) -> None:
         """Add an error at `path`."""
         self.errors.append(ErrorDetail(location or self.location(path), ".".join(path), text))
@@ -63,7 +70,7 @@ class Tree:
 def load_tree(
     file: Path, overlays: Sequence[Path] = (), sets: Sequence[str] = (), sections: Mapping[str, Section] | None = None
 ) -> Tree:
-    """Read `file` with its includes, then merge `overlays` and `sets` ("track.radius_m=0.8") over it.
+    """Read `file` with its includes, then merge `overlays` and `sets` ("detect.accept_probability=0.9") over it.
 
     `sections` replace whole sections of the file itself, below the overlays: a recording has its own `rig`, as text.
 
@@ -156,7 +163,7 @@ def _read(file: Path, tree: Tree, including: tuple[Path, ...]) -> Tree:
     if text.values is None:
         return failed("is empty.")
     if not isinstance(text.values, dict):
-        return failed("must be a mapping with 'stages:' and 'links:' at the top.", 1)
+        return failed("must be a mapping at the top, as in 'name: value'.", 1)
     own = _tree_of_text(text, str(file))
     tree.errors += own.errors
     own.errors = []
@@ -312,16 +319,17 @@ def _merge_mapping(base: Tree, top: Tree, path: KeyPath, below: dict[str, Any], 
 
 
 def _set(tree: Tree, text: str) -> None:
-    """Apply `track.radius_m=0.8`: a stage's or link's name and a setting, or a whole path (`rig.drone.span_m=0.35`).
+    """Apply a changed setting: a stage's or link's name and the setting (`detect.accept_probability=0.9`), or a path.
 
-    In a file without stages and links, such as a scenario, every key is a whole path.
+    A path begins with a section (`rig.drone.span_m=0.35`). In a file without stages and links, such as a scenario, every key is a whole path.
     """
     location = Location(f"--set {text}", 0)
     key, equals, raw = text.partition("=")
     parts = tuple(key.strip().split("."))
     of_graph = bool(tree.values.keys() & {"stages", "links"})
     if not equals or len(parts) < 1 + of_graph or not all(parts):
-        tree.error((), "must read NAME.SETTING=VALUE, as in --set track.radius_m=0.8.", location)
+        form, example = SET_FORMS[of_graph]
+        tree.error((), f"must read {form}=VALUE, as in --set {example}.", location)
         return
     if of_graph and parts[0] not in ("stages", "links", "rig"):
         kinds = [kind for kind in ("stages", "links") if parts[0] in (tree.values.get(kind) or {})]

@@ -11,14 +11,14 @@ from typing import Annotated, Any
 
 import typer
 import yaml
-from pydantic import ValidationError
 
-from flow.config.tree import load_tree
+from flow.config.setting_errors import check_values
+from flow.config.tree import Tree, load_tree
 from flow.config.yaml_text import YamlTextError, yaml_values
-from flow.config_error import ConfigError
+from flow.config_error import ConfigError, Location
 from flow.link import LinkError
 from links.cli.console import EXIT_FAILED, check_new, err, out, progress_bar, report_errors, warn
-from stages.geometry.frames import LidarMount
+from stages.geometry.rig import Rig
 
 MAX_RIG_BYTES = 100_000
 BEAM_FILES = (".json", ".csv")  # an Ouster's metadata, a Hesai XT's angle correction
@@ -142,12 +142,10 @@ def read_rig(file: Path) -> str:
             f"{file}: lidar.mount is missing: add `include: FILE` of the rig that has it, or the mount as "
             "configs/rigs/standard.yaml has it"
         )
-    try:
-        LidarMount.model_validate(mount)
-    except ValidationError as errors:
-        first = errors.errors(include_url=False)[0]
-        where = ".".join(str(part) for part in ("lidar", "mount", *first["loc"]))
-        raise LinkError(f"{file}: {where}: {first['msg']}") from None
+    checked = Tree(root=Location(str(file), 0))
+    check_values(checked, (), Rig, rig, "rig")
+    if checked.errors:
+        raise LinkError(str(checked.errors[0]))
     return yaml.safe_dump(rig, sort_keys=False)
 
 

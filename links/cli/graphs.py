@@ -17,12 +17,13 @@ from flow.config.hosts import Hosts
 from flow.config.hosts_file import load_hosts
 from flow.config.schema import schema as schema_of
 from flow.config_error import ConfigError
-from flow.graph import Graph, load_graph
+from flow.graph import Graph
 from links.cli.console import EXIT_FAILED, EXIT_USAGE, err, out, report_errors, warn
 from links.cli.options import Config, Overlay, Sets
 from links.preflight.shipped_values import shipped_values
 from links.runs.request import RunRequest
 from links.zenoh import host_graph
+from stages.geometry.rig import Rig
 
 OutFile = Annotated[Path | None, typer.Option("--out", "-o", help="File to write [default: the terminal].")]
 HostsFile = Annotated[Path | None, typer.Option("--hosts", help="A hosts file: which host runs what.")]
@@ -45,7 +46,7 @@ def check(config: Config, overlay: Overlay = None, sets: Sets = None, hosts: Hos
     Example: grd check configs/paper.yaml --set track.radius_m=0.8
     """
     try:
-        graph = RunRequest(config, tuple(overlay or ()), tuple(sets or ())).graph(None, "")
+        graph = RunRequest(config, tuple(overlay or ()), tuple(sets or ())).graph()
         placed = load_hosts(hosts, graph) if hosts is not None else None
     except ConfigError as error:
         for entry in error.errors:
@@ -88,7 +89,7 @@ def graph(
 
     Example: grd graph configs/paper.yaml --format svg -o graph.svg
     """
-    checked = load_graph(config, overlay or (), sets or ())
+    checked = RunRequest(config, tuple(overlay or ()), tuple(sets or ())).graph()
     if host is not None and hosts is None:
         err.print("--host NAME needs --hosts FILE")
         raise typer.Exit(EXIT_USAGE)
@@ -116,7 +117,7 @@ def schema(out_file: OutFile = None) -> None:
 
     Example: grd schema -o configs/grd.schema.json
     """
-    _write(json.dumps(schema_of(), indent=1, sort_keys=True) + "\n", out_file)
+    _write(json.dumps(schema_of(Rig), indent=1, sort_keys=True) + "\n", out_file)
 
 
 def _write(text: str, file: Path | None) -> None:

@@ -19,7 +19,7 @@ from typing import Any
 import yaml
 
 from flow.config.yaml_text import YamlTextError, yaml_values
-from flow.graph import Graph, load_graph
+from flow.graph import Graph
 from flow.link import LinkError, Tap
 from flow.live.input_order import END_TOPIC, ORDER_TOPIC, read_orders
 from flow.live.rerun import Rerun
@@ -105,7 +105,7 @@ def _graph_of(session: Session, trusted: bool) -> tuple[Graph, RunRequest]:
     with tempfile.TemporaryDirectory() as folder:
         config = Path(folder, "config.yaml")
         config.write_text(yaml.safe_dump(values, sort_keys=False), encoding="utf-8")
-        graph = load_graph(config, packages=None if trusted else PACKAGES)
+        graph = RunRequest(config).graph(packages=None if trusted else PACKAGES)
     if not trusted:
         from links.viewer import Viewer  # imports Rerun
 

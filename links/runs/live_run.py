@@ -48,7 +48,7 @@ ShowStatus = Callable[[RunStatus], None]
 
 def live_graph(request: RunRequest) -> Graph:
     """The graph of a configuration that can run live. Raises ConfigError, LinkError."""
-    graph = request.graph(None, "")
+    graph = request.graph()
     if not any(issubclass(spec.cls, Source) and spec.cls.listen is not Source.listen for spec in graph.nodes.values()):
         raise LinkError(f"{request.config}: no link of this configuration can run live")
     return graph

@@ -17,11 +17,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from flow.config.yaml_text import YamlTextError, yaml_values
-from flow.graph import load_graph
 from flow.link import TRUTH_TOPICS, LinkError, Tap
 from flow.replay import replay
 from flow.taps import Digest
 from links.recording import Session
+from links.runs.request import RunRequest
 
 HASHES_FILE = "hashes.json"
 CONFIGS = ("replay", "paper", "estimate")  # of configs/; pinned for every recording
@@ -109,18 +109,17 @@ def measure(pins: list[Pin], jobs: int) -> Iterator[PinResult]:
 def output_hash(recording: Path, config: Path) -> str:
     """Replay a recording through a configuration without its taps, in one process, every array checked."""
     session = Session(recording)
-    sections = None if session.rig_yaml is None else {"rig": (session.rig_yaml, f"{recording} (rig.yaml)")}
-    graph = load_graph(config, [], _without_taps(config), sections)
+    graph = RunRequest(config, sets=_without_taps(config)).graph(session.rig_yaml, f"{recording} (rig.yaml)")
     digest = Digest()
     records = (record for record in session.records() if not record.topic.startswith(TRUTH_TOPICS))
     replay(graph, records, [digest], strict=True)
     return digest.hexdigest()
 
 
-def _without_taps(config: Path) -> list[str]:
+def _without_taps(config: Path) -> tuple[str, ...]:
     """Settings that disable the taps of a configuration: the viewer takes half the time of a replay."""
-    graph = load_graph(config, [], [], None)
-    return [f"links.{spec.name}=null" for spec in graph.nodes.values() if issubclass(spec.cls, Tap)]
+    nodes = RunRequest(config).graph().nodes.values()
+    return tuple(f"links.{spec.name}=null" for spec in nodes if issubclass(spec.cls, Tap))
 
 
 def _has_cameras(recording: Path) -> bool:

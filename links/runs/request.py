@@ -5,6 +5,7 @@ Source: ours.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from links.runs.fused_poses import FULL, FusedPoses
 from links.runs.results import Results
 from links.runs.truth import FixErrors
 from links.runs.usage import Usage
+from stages.geometry.rig import Rig
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,13 +28,14 @@ class RunRequest:
     overlays: tuple[Path, ...] = ()
     sets: tuple[str, ...] = ()
 
-    def graph(self, rig_yaml: str | None, where: str) -> Graph:
+    def graph(self, rig_yaml: str | None = None, where: str = "", packages: Collection[str] | None = None) -> Graph:
         """The graph on the rig `rig_yaml`, read from `where`, or (None) on the rig of the configuration.
 
-        Raises ConfigError for both, and for a pose that would be sent to another drone's autopilot.
+        `packages`: as in `load_graph`. Raises ConfigError for both, and for a pose that would be sent to another
+        drone's autopilot.
         """
         sections = None if rig_yaml is None else {"rig": (rig_yaml, where)}
-        graph = load_graph(self.config, self.overlays, self.sets, sections)
+        graph = load_graph(self.config, self.overlays, self.sets, sections, packages=packages, rig=Rig)
         if errors := _poses_of_other_drones(graph, str(self.config)):
             raise ConfigError(errors)
         return graph

@@ -1,4 +1,4 @@
-"""The rig's cameras, and great-circle arcs as line strips on the unit sphere and in the image.
+"""Great-circle arcs as line strips on the unit sphere and in the image.
 
 Source: ours; lenses: stages/geometry/lens.py; a straight line in space is a great circle of rays, P IV.
 """
@@ -7,62 +7,11 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
 
-from stages.geometry.frames import Array64, Pose
-from stages.geometry.lens import Lens
-from stages.messages import CameraMount
+from stages.geometry.frames import Array64
+from stages.geometry.rig import DroneCamera, VehicleCamera
 
 ARC_STEP_RAD = np.deg2rad(4.0)  # spacing of the points of an arc; a fisheye bends a chord by less than 0.1 px
-
-
-class _Camera(BaseModel):
-    """One camera of the rig file, without the keys that only stages use."""
-
-    model_config = ConfigDict(extra="ignore", frozen=True)
-
-    lens: Lens
-    size_px: int | None = Field(None, ge=1)  # side of the square calibration images
-
-    def pose(self) -> Pose:
-        raise NotImplementedError
-
-
-class VehicleCamera(_Camera):
-    """The camera on the vehicle."""
-
-    T_vehicle_camera: Pose
-
-    def pose(self) -> Pose:
-        """T_mount_camera."""
-        return self.T_vehicle_camera
-
-
-class DroneCamera(_Camera):
-    """The camera under the drone."""
-
-    T_drone_camera: Pose
-
-    def pose(self) -> Pose:
-        """T_mount_camera."""
-        return self.T_drone_camera
-
-
-class Cameras(BaseModel):
-    """The rig file's `cameras:`."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    vehicle: VehicleCamera | None = None
-    drone: DroneCamera | None = None
-
-    def of(self, camera_mount: CameraMount) -> VehicleCamera | DroneCamera | None:
-        """The camera on a mount, None without one."""
-        return self.vehicle if camera_mount is CameraMount.VEHICLE else self.drone
-
-    def frame_ids(self) -> list[str]:
-        """Frame ids of the images of the configured cameras."""
-        return [f"camera_{camera_mount.value}" for camera_mount in CameraMount if self.of(camera_mount) is not None]
 
 
 def pixels_of(camera: VehicleCamera | DroneCamera, rays_mount: Array64) -> Array64:

@@ -17,8 +17,8 @@ from links.mavlink.poses.gate import PoseLimits
 from links.mavlink.profiles import YawOutput
 from links.viewer import colours
 from links.viewer.entities import Entities, Entity, stage_of
-from links.viewer.lenses import Cameras
 from stages.geometry.frames import Array64, LidarMount, rotation_z, transform
+from stages.geometry.rig import RigCameras
 from stages.messages import CameraMount, Candidates, DepthImage, DroneFix, TrackingState, TrackState
 
 TIMELINE = "sensor_time"
@@ -80,13 +80,13 @@ class ViewerScene:
         slice_s: float,
         max_points: int,
         trail_s: float,
-        cameras: Cameras | None = None,
+        cameras: RigCameras | None = None,
         image_period_s: float = 0.0,
         gate: Gate | None = None,
     ):
         """`gate`: of the autopilot link; None: nothing is sent to an autopilot."""
         self.mount = mount
-        self.cameras = cameras or Cameras()
+        self.cameras = cameras or RigCameras()
         self.images: dict[str, LoggedImage] = {}  # by frame id, the last one logged
         self._image_period_ns = int(image_period_s * 1e9)
         self.gate = gate

@@ -25,11 +25,11 @@ from links.viewer.draw import draw
 from links.viewer.draw_pose import TrueTrack
 from links.viewer.entities import Entity
 from links.viewer.layout import Vision, layout
-from links.viewer.lenses import Cameras
 from links.viewer.message_queue import MessageQueue, Slicer
 from links.viewer.scene import Gate, ViewerScene, drone_sphere, initial_frames, spheres, static_entities
 from links.viewer.stream import LOOPBACK, Stream
 from stages.geometry.frames import LidarMount
+from stages.geometry.rig import RigCameras
 from stages.messages import CameraMount
 
 PUT_TIMEOUT_S = 10.0  # a lossless run waits this long for a stalled viewer
@@ -59,7 +59,7 @@ class ViewerSettings(Settings):
     max_points_per_slice: int = Field(6000, ge=1)
     trail_s: float = Field(20.0, ge=0)  # duration of the visible trail of a drone
     mount: LidarMount | None = None  # with it, the turntable, the LiDAR and the fan of its beams are drawn
-    cameras: Cameras | None = None  # of the rig; with it, lines are drawn on the images
+    cameras: RigCameras | None = None  # of the rig; with it, lines are drawn on the images
 
 
 class Viewer(Tap[ViewerSettings]):

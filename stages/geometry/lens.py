@@ -29,6 +29,7 @@ from stages.geometry.frames import Array64
 from stages.kernels.geometry.lens import ANGLE_SERIES, OCAM, polynomial_kernel, project, rho_of_theta, series, unproject
 
 Pixel = tuple[float, float]
+Polygon = Annotated[tuple[Pixel, ...], Field(min_length=3)]  # corners (column, row)
 
 WIDEST_RHO = 20.0  # focal lengths; no image circle is wider
 

@@ -22,11 +22,11 @@ import math
 from typing import Any, ClassVar
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from flow.stage import Settings, Stage
 from stages.geometry.frames import Pose
-from stages.geometry.lens import Array64, Lens
+from stages.geometry.lens import Array64, Lens, Polygon
 from stages.geometry.trajectory import VehicleTrajectory
 from stages.messages import CameraMount, DroneTilt, Image, VanishingDirections, VehicleMotion
 from stages.vp.arcs import fit_arcs
@@ -34,7 +34,7 @@ from stages.vp.clustering import cluster
 from stages.vp.directions import lines_of
 from stages.vp.edges import EdgeFinder
 from stages.vp.gravity import TiltBuffer
-from stages.vp.pixel_rays import PixelRays, Polygon, make_pixel_rays
+from stages.vp.pixel_rays import PixelRays, make_pixel_rays
 from stages.vp.search import FoundDirections, SearchLimits, VerticalPrior, find_structure
 
 MIN_POINTS = 6  # of a chain
@@ -71,12 +71,6 @@ class GreatCircleVpSettings(Settings):
     confident_elsewhere_score: float = Field(6.0, ge=-100)
     weak_sigma_deg: float = Field(15.0, ge=0, le=60)  # of the directions of a weak pair
     least_sigma_deg: float = Field(0.15, gt=0, le=5)  # beyond that of the lines: buildings are not exactly square
-
-    @model_validator(mode="after")
-    def _settings_agree(self) -> GreatCircleVpSettings:
-        if any(len(polygon) < 3 for polygon in self.masked_px):
-            raise ValueError("masked_px: a polygon has at least three corners (column, row)")
-        return self
 
 
 class GreatCircleVp(Stage[GreatCircleVpSettings]):

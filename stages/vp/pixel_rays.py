@@ -12,11 +12,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.geometry.lens import Array64, Lens
+from stages.geometry.lens import Array64, Lens, Polygon
 from stages.kernels.vp.arcs import STEP_PX
 
 RIM_PX = 7  # width of the excluded rim of the image circle; more than the diagonal of a table cell
-Polygon = tuple[tuple[float, float], ...]
 
 
 @dataclass(frozen=True)

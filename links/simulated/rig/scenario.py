@@ -12,10 +12,11 @@ from typing import Any, Literal, Self
 
 import numpy as np
 import yaml
-from pydantic import Field, ValidationError, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
+from flow.config.setting_errors import check_values
 from flow.config.tree import load_tree, resolve
-from flow.config_error import ConfigError, did_you_mean
+from flow.config_error import ConfigError
 from flow.stage import StrictModel
 from links.simulated.autopilot.autopilot import AutopilotSettings
 from links.simulated.cues.cue_errors import CueSettings
@@ -246,14 +247,7 @@ def load_scenario(path: FilePath, sets: Sequence[str] = ()) -> Scenario:
     tree = load_tree(path, sets=sets)
     values = resolve(tree, (), tree.values)
     if not tree.errors:
-        try:
-            return Scenario.model_validate(values)
-        except ValidationError as errors:
-            for error in errors.errors(include_url=False):
-                where = tuple(str(part) for part in error["loc"])
-                if error["type"] == "extra_forbidden":
-                    known = Scenario.model_fields if len(where) == 1 else ()
-                    tree.error(where, f"unknown key '{where[-1]}'.{did_you_mean(where[-1], known)}")
-                else:
-                    tree.error(where, f"{error['msg'].removeprefix('Value error, ')}.")
-    raise ConfigError(tree.errors)
+        check_values(tree, (), Scenario, values, "scenario")
+    if tree.errors:
+        raise ConfigError(tree.errors)
+    return Scenario.model_validate(values)

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated
 
 import cv2
 import numpy as np
@@ -24,12 +23,11 @@ from pydantic import Field
 
 from flow.stage import StrictModel
 from stages.geometry.frames import Array64
-from stages.geometry.lens import Equidistant, KannalaBrandt, OCam
+from stages.geometry.lens import Equidistant, KannalaBrandt, OCam, Polygon
 from stages.kernels.visual import patches
 from stages.kernels.visual.features import best_per_cell
 from stages.kernels.visual.patches import Array32, Grey
 
-Polygon = Annotated[tuple[tuple[float, float], ...], Field(min_length=3)]
 MIN_SIDE_PX = 32
 HALF = 2  # corners are detected in the image at half size
 BORDER_PX = 12

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
 
-from flow.config.classes import known_classes
+from flow.config.classes import EXTRAS, known_classes
 from flow.config_error import ConfigError
 from flow.graph import Graph, load_graph
 from tests.flow.toys import GRAPH
@@ -214,7 +215,7 @@ def test_a_missing_file_is_an_error_with_a_similar_name(tmp_path):
     ("content", "text"),
     [
         (b"", "x.yaml: is empty."),
-        (b"- 1\n", "x.yaml:1: must be a mapping with 'stages:' and 'links:' at the top."),
+        (b"- 1\n", "x.yaml:1: must be a mapping at the top, as in 'name: value'."),
         (b"\xff\xfe\x00", "x.yaml: is not UTF-8 text (byte 0)."),
         (b"a: " + b"[" * 5000, "x.yaml"),
         (b"#" * 1_000_001, "x.yaml: larger than 1000000 bytes: that is no configuration."),
@@ -247,6 +248,19 @@ def test_a_module_that_does_not_define_the_class_is_not_imported(tmp_path, monke
     assert not (tmp_path / "executed").exists()
 
 
+@pytest.mark.parametrize(("library", "extra"), EXTRAS.items())
+def test_a_missing_library_is_named_with_the_extra_that_installs_it(tmp_path, monkeypatch, library, extra):
+    (tmp_path / "needy_module.py").write_text(f"import {library}.part\n\n\nclass Double: ...\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setitem(sys.modules, library, None)  # importing it raises ImportError
+    (error, *_) = errors_of(tmp_path, GRAPH.replace("tests.flow.toys.Double", "needy_module.Double"))
+    assert error.startswith("x.yaml:3: stages.double.use: 'needy_module' cannot be imported: ")
+    assert error.endswith(f": pip install -e '.[{extra}]'")
+    project = tomllib.loads((Path(__file__).parents[3] / "pyproject.toml").read_text(encoding="utf-8"))
+    distribution = {"sklearn": "scikit-learn"}.get(library, library)
+    assert any(named.startswith(distribution) for named in project["project"]["optional-dependencies"][extra])
+
+
 def test_only_a_driver_that_cannot_be_imported_is_not_suggested(monkeypatch):
     before = known_classes("links")
     for name in [name for name in sys.modules if name == "links.camera" or name.startswith("links.camera.")]:
@@ -272,7 +286,7 @@ def test_set_changes_a_setting_by_the_stages_name(tmp_path):
     ("option", "text"),
     [
         ("ad.window=7", "--set ad.window=7: no stage or link 'ad'. Did you mean 'add'?"),
-        ("add.window", "--set add.window: must read NAME.SETTING=VALUE, as in --set track.radius_m=0.8."),
+        ("add.window", "--set add.window: must read NAME.SETTING=VALUE, as in --set detect.accept_probability=0.9."),
         ("add.window=0", "--set add.window=0: stages.add.config.window: must be greater than or equal to 1, got 0."),
         ("add.windw=4", "--set add.windw=4: stages.add.config.windw: unknown setting 'windw'. Did you mean 'window'?"),
         ("add.window=[1", "--set add.window=[1: the value is not YAML: expected ',' or ']', but got '<stream end>'."),

@@ -7,6 +7,7 @@ import xml.etree.ElementTree as ET
 from flow.config.draw import mermaid, svg
 from flow.config.schema import schema
 from flow.graph import load_graph
+from stages.geometry.rig import Rig
 from tests.flow.toys import GRAPH
 
 
@@ -50,10 +51,20 @@ def test_a_queue_is_drawn_where_an_edge_declares_it(tmp_path):
 
 
 def test_the_schema_accepts_an_edge_as_text_or_with_its_queue():
-    edge = schema()["$defs"]["edge"]["anyOf"]
+    edge = schema(Rig)["$defs"]["edge"]["anyOf"]
     assert edge[1]["properties"]["policy"]["enum"] == ["latest", "drop_oldest"]
-    stages, links = (schema()["properties"][kind]["additionalProperties"]["properties"] for kind in ("stages", "links"))
+    stages, links = (
+        schema(Rig)["properties"][kind]["additionalProperties"]["properties"] for kind in ("stages", "links")
+    )
     assert "thread" in stages
     assert "thread" in links
     assert "process" in stages
     assert "process" not in links
+
+
+def test_the_schema_has_the_keys_of_the_rig_and_requires_none():
+    whole = schema(Rig)
+    rig = whole["properties"]["rig"]
+    assert rig["additionalProperties"] is False
+    assert set(rig["properties"]) == {"version", "lidar", "drone", "cameras"}
+    assert "required" not in whole["$defs"]["DroneCamera"]

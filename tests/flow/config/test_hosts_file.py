@@ -128,3 +128,8 @@ def test_a_node_that_is_left_out_may_have_a_host(load):
     assert graph_of_host(hosts, "vehicle", NoEnds()).left_out_texts() == hosts.graph.left_out_texts()
     found = errors_of(load, GOOD.replace("words: base", "words: moon"), config)
     assert found == ["6: placement.words: no host 'moon'; there is 'vehicle', 'drone' or 'base'."]
+
+
+def test_a_file_that_is_no_mapping_is_an_error_without_the_sections_of_other_files(load):
+    with pytest.raises(ConfigError, match=r"hosts\.yaml:1: must be a mapping at the top, as in 'name: value'\.$"):
+        load("- a\n")

@@ -272,7 +272,12 @@ def test_an_import_takes_the_rig_of_a_file_or_of_a_configuration(grd, tmp_path):
     capture = ROOT / "tests" / "links" / "recording" / "none.pcap"
     assert grd("import", capture, code=2).startswith(f"{capture}: no such file")
     for name, text, words in [
-        ("a.yaml", "lidar: {mount: {turn: true}}", "a.yaml: lidar.mount.turn: Extra inputs are not permitted"),
+        (
+            "a.yaml",
+            "lidar: {mount: {turn: true}}",
+            "a.yaml: lidar.mount.turn: unknown setting 'turn'. Did you mean 'turns'?",
+        ),
+        ("e.yaml", "lidar: {mount: {}}\ndrone: {span: 1}", "e.yaml: drone.span: unknown setting 'span'."),
         ("b.yaml", "- 1", "b.yaml is no rig: it needs 'lidar:'"),
         ("c.yaml", "a: [", "c.yaml is no rig: "),
         ("d.yaml", "rig: {lidar: {model: XT16}}", "d.yaml: lidar.mount is missing: add `include: FILE`"),

@@ -9,8 +9,8 @@ import numpy as np
 import synthetic
 
 from flow.message import Message
-from links.viewer.lenses import Cameras
 from stages.geometry.frames import rotation_z
+from stages.geometry.rig import RigCameras
 from stages.messages import BranchState, CameraMount, Image, RelativeRotation, VanishingDirections, VisualMotion
 
 SIZE_PX = 720
@@ -27,7 +27,7 @@ RIG_CAMERAS = {
     | {"T_vehicle_camera": {"rpy_deg": [0.0, 0.0, 90.0]}},  # points up, image right is left's opposite
     "drone": CAMERA | {"T_drone_camera": {"rpy_deg": [180.0, 0.0, -90.0]}},
 }
-CAMERAS = Cameras.model_validate(RIG_CAMERAS)
+CAMERAS = RigCameras.model_validate(RIG_CAMERAS)
 DIRECTIONS = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0], [0.6, 0.8, 0], [-0.8, 0.6, 0]])
 FRAMES = np.array([-1, 0, 0, 1, 1])
 MERMAID = (

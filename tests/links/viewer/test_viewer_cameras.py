@@ -18,7 +18,8 @@ from links.viewer import Viewer, colours
 from links.viewer.draw import draw
 from links.viewer.draw_cameras import direction_colours
 from links.viewer.entities import strip_batch
-from links.viewer.lenses import Cameras, arcs, strips
+from links.viewer.lenses import arcs, strips
+from stages.geometry.rig import RigCameras
 from stages.messages import CameraMount, FollowedFeatures
 
 VP, LINES = "vp_vehicle/vanishing_directions", "camera/camera_vehicle/vp_vehicle/vanishing_directions/lines"
@@ -211,12 +212,12 @@ def test_a_lens_of_another_image_size_is_rejected():
 
 def test_the_cameras_of_the_rig_are_valid_and_a_wrong_one_is_named():
     assert synthetic_vision.CAMERAS.frame_ids() == ["camera_vehicle", "camera_drone"]
-    assert Cameras().frame_ids() == []
+    assert RigCameras().frame_ids() == []
     swapped = {"vehicle": synthetic_vision.RIG_CAMERAS["drone"]}
     with pytest.raises(ValidationError, match="T_vehicle_camera"):
-        Cameras.model_validate(swapped)
+        RigCameras.model_validate(swapped)
     with pytest.raises(ValidationError, match="left"):
-        Cameras.model_validate({"left": synthetic_vision.RIG_CAMERAS["drone"]})
+        RigCameras.model_validate({"left": synthetic_vision.RIG_CAMERAS["drone"]})
 
 
 def record(folder, viewer, mermaid=synthetic_vision.MERMAID, seconds=0.35):

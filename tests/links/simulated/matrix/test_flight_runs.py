@@ -45,7 +45,7 @@ def test_a_flight_that_its_scene_does_not_allow_does_not_stop_the_others(tmp_pat
 
 
 def test_a_wrong_setting_is_an_error_before_the_first_flight(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"--set autopilot\.imu_khz=1.*unknown key 'imu_khz'"):
+    with pytest.raises(ConfigError, match=r"--set autopilot\.imu_khz=1.*unknown setting 'imu_khz'"):
         fly(tmp_path, "autopilot.imu_khz=1")
     assert not list(tmp_path.iterdir())
 

@@ -193,12 +193,12 @@ def test_the_committed_recording_is_small_and_states_its_origin() -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"duration": 3}, "duration: unknown key 'duration'. Did you mean 'duration_s'?"),
-        ({"duration_s": -1}, "duration_s: Input should be greater than 0"),
+        ({"duration": 3}, "duration: unknown setting 'duration'. Did you mean 'duration_s'?"),
+        ({"duration_s": -1}, "duration_s: must be greater than 0, got -1."),
         ({"drone": None}, "follow_drone is set but the scenario has no drone"),
         ({"start_utc": "2025-06-01T10:20:30"}, "give the time zone"),
         ({"drone": {"path": {"waypoints": [{"t_s": 0, "xyz_m": [5, 0, -1.6]}]}}}, "0.20 m above the road at 0.00 s"),
-        ({"script": [{"do": "spin"}]}, "script.0: Input tag 'spin'"),
+        ({"script": [{"do": "spin"}]}, "script.0: 'do' must be 'sweep' or 'vibrate', not 'spin'"),
         (
             {"rig": {"model": "OS0-32"}, "lidar": {"return_mode": "dual"}},
             "packets hold strongest returns: set strongest",
@@ -222,6 +222,11 @@ def test_a_file_that_is_missing_or_not_yaml_is_an_error(tmp_path: FilePath) -> N
     (tmp_path / "bad.yaml").write_text("a: [1", encoding="utf-8")
     with pytest.raises(ConfigError, match=r"bad\.yaml:1: is not YAML"):
         load_scenario(tmp_path / "bad.yaml")
+    (tmp_path / "list.yaml").write_text("- a", encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"list\.yaml:1: must be a mapping at the top, as in 'name: value'\.$"):
+        load_scenario(tmp_path / "list.yaml")
+    with pytest.raises(ConfigError, match=r"--set x: must read KEY=VALUE, as in --set autopilot\.imu_hz=25\.$"):
+        load_scenario(STREET, ["x"])
 
 
 def test_a_scenario_may_include_another_and_change_it(tmp_path: FilePath) -> None:

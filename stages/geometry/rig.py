@@ -1,0 +1,81 @@
+"""The rig: what the `rig:` section of a configuration, a rig file, and the rig attached to a recording may contain.
+
+Settings refer to its values one by one (`$rig.drone.span_m`), each stage to those that it needs; `Rig` is the whole.
+
+Source: ours; the format of configs/rigs/standard.yaml.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from flow.stage import StrictModel
+from stages.geometry.frames import Pose
+from stages.geometry.lens import Lens, Polygon
+from stages.geometry.rig_lidar import RigLidar
+from stages.messages import CameraMount
+
+
+class RigDrone(StrictModel):
+    """`rig.drone`."""
+
+    span_m: float = Field(0.5, gt=0, le=10)  # largest dimension
+
+
+class _Camera(StrictModel):
+    """What both cameras have."""
+
+    lens: Lens
+    size_px: int | None = Field(None, ge=1)  # side of the square calibration images; None: not known, or not square
+    max_off_axis_deg: float | None = Field(None, gt=0, le=150)  # rays farther off axis are not used; None: lens's limit
+    masked_px: tuple[Polygon, ...] = ()  # over the body of the vehicle or drone
+    readout_ms: float = Field(0.0, ge=0, le=100)  # from the first row's exposure to the last's: a rolling shutter
+
+    def pose(self) -> Pose:
+        raise NotImplementedError
+
+
+class VehicleCamera(_Camera):
+    """`rig.cameras.vehicle`."""
+
+    T_vehicle_camera: Pose
+
+    def pose(self) -> Pose:
+        """T_mount_camera."""
+        return self.T_vehicle_camera
+
+
+class DroneCamera(_Camera):
+    """`rig.cameras.drone`."""
+
+    T_drone_camera: Pose
+
+    def pose(self) -> Pose:
+        """T_mount_camera."""
+        return self.T_drone_camera
+
+
+class RigCameras(StrictModel):
+    """`rig.cameras`."""
+
+    vehicle: VehicleCamera | None = None
+    drone: DroneCamera | None = None
+
+    def of(self, camera_mount: CameraMount) -> VehicleCamera | DroneCamera | None:
+        """The camera on a mount, None without one."""
+        return self.vehicle if camera_mount is CameraMount.VEHICLE else self.drone
+
+    def frame_ids(self) -> list[str]:
+        """Frame ids of the images of the configured cameras."""
+        return [f"camera_{camera_mount.value}" for camera_mount in CameraMount if self.of(camera_mount) is not None]
+
+
+class Rig(StrictModel):
+    """The whole rig."""
+
+    version: Literal[1] = 1  # of this format
+    lidar: RigLidar | None = None
+    drone: RigDrone | None = None
+    cameras: RigCameras | None = None

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from flow.config.classes import known_classes
 from links import __version__
 from links.cli.app import COMMANDS
 
@@ -54,6 +55,20 @@ def test_every_configuration_in_a_document_exists(file):
     }
     for path in re.findall(r"\bconfigs/[\w/]+\.yaml\b", file.read_text(encoding="utf-8")):
         assert path in made or (ROOT / path).is_file(), f"{name_of(file)} names {path}"
+
+
+def named_in(reference: str) -> set[str]:
+    return set(re.findall(r"^::: (\S+)$", (ROOT / "docs/reference" / reference).read_text(encoding="utf-8"), re.M))
+
+
+def test_the_reference_has_every_stage():
+    known = {f"{stage.__module__}.{stage.__qualname__}" for stage in known_classes("stages").values()}
+    assert named_in("stages.md") == known | {"stages.track.imm_track.ImmPdafTrack"}  # known with its libraries only
+
+
+def test_the_reference_has_every_module_of_messages():
+    modules = {file.stem for file in (ROOT / "stages/messages").glob("*.py")} - {"__init__"}
+    assert named_in("messages.md") == {f"stages.messages.{module}" for module in modules}
 
 
 def test_the_readme_fits_a_page_and_its_lines_a_screen():

@@ -321,7 +321,8 @@ def _merge_mapping(base: Tree, top: Tree, path: KeyPath, below: dict[str, Any], 
 def _set(tree: Tree, text: str) -> None:
     """Apply a changed setting: a stage's or link's name and the setting (`detect.accept_probability=0.9`), or a path.
 
-    A path begins with a section (`rig.drone.span_m=0.35`). In a file without stages and links, such as a scenario, every key is a whole path.
+    A path begins with a section (`rig.drone.span_m=0.35`). In a file without stages and links, such as a scenario,
+    every key is a path.
     """
     location = Location(f"--set {text}", 0)
     key, equals, raw = text.partition("=")

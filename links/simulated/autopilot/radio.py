@@ -9,12 +9,11 @@ Source: ours.
 
 from __future__ import annotations
 
-from typing import Self
-
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from flow.stage import StrictModel
+from links.simulated.world.path import TimeSpan
 
 BITS_PER_BYTE = 10  # start and stop bit of a serial line
 
@@ -27,13 +26,7 @@ class RadioSettings(StrictModel):
     bitrate_bps: float = Field(default=921_600.0, ge=9_600)
     loss_fraction: float = Field(default=0.0, ge=0, lt=1)
     loss_burst_frames: float = Field(default=3.0, ge=1)  # mean length of a burst
-    outages_s: tuple[tuple[float, float], ...] = ()  # (from, to) since the start
-
-    @model_validator(mode="after")
-    def _outages_last(self) -> Self:
-        if any(end <= begin for begin, end in self.outages_s):
-            raise ValueError("outages_s: each is (from, to) with to after from")
-        return self
+    outages_s: tuple[TimeSpan, ...] = ()
 
 
 class Radio:

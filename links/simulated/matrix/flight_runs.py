@@ -23,6 +23,7 @@ from flow.link import LinkError
 from flow.ports import RunError
 from links.runs.request import RunRequest
 from links.simulated.rig.closed_loop import ClosedLoop, loop_metadata
+from links.simulated.rig.flight_in_the_loop import check_loop
 from links.simulated.rig.run import Simulation
 from links.simulated.rig.scenario import load_scenario
 
@@ -67,9 +68,12 @@ def fly_all(
     workers: Workers,
     progress: Callable[[float, float], None],
 ) -> list[FlightResult]:
-    """Fly each scenario with each seed, seed by seed. ConfigError for a scenario or the configuration."""
+    """Fly each scenario with each seed, seed by seed. ConfigError, LinkError for a scenario or the configuration."""
     for scenario in scenarios:  # errors in files before the first flight
-        RunRequest(config).graph(load_scenario(scenario, sets).rig_yaml(), f"{scenario} (rig)")
+        loaded = load_scenario(scenario, sets)
+        if loaded.autopilot is None or loaded.autopilot.flight_stack is None:
+            raise LinkError(f"{scenario}: no autopilot in the loop, set autopilot.flight_stack")
+        check_loop(RunRequest(config).graph(loaded.rig_yaml(), f"{scenario} (rig)"), loaded)
     tasks = [FlightTask(s, tuple(sets), config, seed, folder) for seed, s in product(seeds, scenarios)]
     folder.mkdir(parents=True, exist_ok=True)
     return run_all(fly, tasks, workers, lambda shares: progress(float(sum(shares)), len(tasks)))
@@ -87,8 +91,7 @@ def fly(task: FlightTask, progress: Callable[[float], None]) -> FlightResult:
     try:
         loop = ClosedLoop(graph, scenario.closed_loop, metadata)
         simulation = Simulation(scenario, loop=loop, record_truth=False)
-        if simulation.flight is None:
-            raise LinkError(f"{task.scenario}: no autopilot in the loop, set autopilot.flight_stack")
+        assert simulation.flight is not None
         for count, record in enumerate(simulation.records()):
             if count % 1000 == 0:
                 progress(min(1.0, (record.arrival_ns - scenario.start_ns) * 1e-9 / scenario.duration_s))

@@ -23,6 +23,7 @@ from pydantic import Field
 from flow.link import Record
 from flow.stage import StrictModel
 from links.simulated.pose_sensors.pose_source import FIX_TOPIC
+from links.simulated.world.path import TimeSpan
 from links.simulated.world.scene import Truth
 
 NS = 1_000_000_000
@@ -41,7 +42,7 @@ class FixSensorSettings(StrictModel):
     variance_share: float = Field(default=0.7, gt=0, le=1)  # true variance of the varying error over the reported one
     velocity_mps: float = Field(default=0.1, ge=0)  # one sigma of the reported velocity
     detection: float = Field(default=0.97, gt=0, le=1)  # probability of each fix
-    of_other_s: tuple[float, float] | None = None  # (from, to): the fixes are those of the first other drone
+    of_other_s: TimeSpan | None = None  # the fixes are those of the first other drone
 
 
 class FixSensor:

@@ -34,6 +34,7 @@ from links.mavlink.poses.sent_frame import SentFrame
 from links.runs.request import RunRequest
 from links.simulated.rig.pose_loop import PoseLoop, PoseTap, has_autopilot
 from links.simulated.sensors.servo import STEP_NS
+from links.simulated.world.path import TimeSpan
 from stages.messages import ServoGoal
 
 LONGEST_BATCH_NS = 40_000_000  # longer batches are not faster
@@ -43,7 +44,7 @@ class ClosedLoopSettings(StrictModel):
     """Compute time of the host on the vehicle."""
 
     compute_s: float = Field(default=0.02, ge=0.003, le=1)  # from arrival of a record to the goal leaving the host
-    killed_s: tuple[float, float] | None = None  # (from, to): grd is not running; it starts again without its state
+    killed_s: TimeSpan | None = None  # grd is not running; it starts again without its state
 
 
 class GoalTap(Tap):
@@ -72,7 +73,7 @@ class ClosedLoop:
     ) -> None:
         """`loop_metadata` is for the recording, names the configuration; `taps` are open and see all messages."""
         self.loop_metadata = loop_metadata
-        self._graph, self._settings = graph, settings
+        self.graph, self._settings = graph, settings
         self._digest, self._taps = Digest(), taps
         self._compute_ns = round(settings.compute_s * 1e9)
         self._start_ns: int | None = None
@@ -82,7 +83,7 @@ class ClosedLoop:
 
     def _start(self) -> None:
         """Build the graph's nodes, and, with an autopilot in the loop, open its session."""
-        graph, goals, poses = self._graph, GoalTap(), PoseTap()
+        graph, goals, poses = self.graph, GoalTap(), PoseTap()
         self._replay = Replay(graph, (self._digest, goals, poses, *self._taps))
         self._servo: Servo | None = None
         if any(issubclass(spec.cls, Lidar | Servo) for spec in graph.nodes.values()):

@@ -7,10 +7,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from flow.graph import Graph
 from flow.link import TRUTH_TOPICS, LinkError, Record
 from links.simulated.autopilot.flight_stack.outcomes.outcome import FlightOutcome, Outcome
 from links.simulated.autopilot.flight_stack.stack import FlightStack
+from links.simulated.pose_sensors.pose_source import SimulatedFixes
 from links.simulated.rig.closed_loop import ClosedLoop
+from links.simulated.rig.pose_loop import has_autopilot, pose_edge
 from links.simulated.rig.scenario import Scenario
 from links.simulated.sensors.vehicle_odometry import VehicleOdometry
 from links.simulated.world.clearance import visible
@@ -19,6 +22,27 @@ from links.simulated.world.scene import Truth
 
 OUTCOME_TOPIC = f"{TRUTH_TOPICS}/flight"
 ABOVE_M = 50.0  # over the place of a take-off, must be free
+
+
+def check_loop(graph: Graph, scenario: Scenario) -> None:
+    """Raise LinkError for a graph that lacks what a scenario in closed loop needs, or reads what it does not have."""
+    reads_fixes = any(issubclass(spec.cls, SimulatedFixes) for spec in graph.nodes.values())
+    if reads_fixes and scenario.fix_sensor is None:
+        raise LinkError(
+            f"the scenario {scenario.name} has no fix_sensor, and the configuration takes its fixes: use a "
+            "configuration with a LiDAR, as configs/sim_flight.yaml, or set fix_sensor={} of the scenario"
+        )
+    if scenario.fix_sensor is not None and not reads_fixes:
+        raise LinkError(
+            f"the scenario {scenario.name} has a fix_sensor instead of a LiDAR, and the configuration does not take "
+            "its fixes: use configs/sim_flight_fixes.yaml, or one that includes it"
+        )
+    stack = None if scenario.autopilot is None else scenario.autopilot.flight_stack
+    if stack is not None and not (has_autopilot(graph) and pose_edge(graph)[1]):
+        raise LinkError(
+            f"the autopilot of the scenario {scenario.name} flies on poses of grd (flight_stack), and the "
+            "configuration sends none: wire 'autopilot: {inputs: {pose: fuse.relative_pose}}', as sim_flight.yaml does"
+        )
 
 
 class FlightInTheLoop:

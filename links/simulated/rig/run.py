@@ -27,7 +27,7 @@ from links.simulated.pose_sensors.fix_sensor import FixSensor
 from links.simulated.pose_sensors.rotation_sensor import RotationSensor
 from links.simulated.rig.closed_loop import ClosedLoop, load_loop
 from links.simulated.rig.cue_sources import cue_sensors, drone_receiver
-from links.simulated.rig.flight_in_the_loop import FlightInTheLoop
+from links.simulated.rig.flight_in_the_loop import FlightInTheLoop, check_loop
 from links.simulated.rig.image_cache import CachedCamera, ImageCache, scenario_world
 from links.simulated.rig.scenario import OtherDroneSettings, Scenario, load_scenario
 from links.simulated.rig.scripted_servo import ServoScript
@@ -91,6 +91,8 @@ class Simulation:
 
         With `images`, a recording of the same flight, the cameras are not rendered.
         """
+        if loop is not None:
+            check_loop(loop.graph, scenario)
         self._loop, self._record_truth = loop, record_truth
         self.scenario = scenario if seed is None else scenario.changed(seed=seed)
         self.seed = self.scenario.seed

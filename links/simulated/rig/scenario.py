@@ -29,7 +29,7 @@ from links.simulated.sensors.lidar import LidarSettings
 from links.simulated.sensors.servo import ServoSettings
 from links.simulated.sensors.vehicle_odometry import VehicleOdometrySettings
 from links.simulated.world.drone import DroneModel, drone_mesh
-from links.simulated.world.path import Path
+from links.simulated.world.path import Path, TimeSpan
 from links.simulated.world.procedural import SceneSettings
 from links.simulated.world.suspension import SuspensionSettings
 from links.simulated.world.vehicle import vehicle_mesh_from_camera
@@ -120,7 +120,7 @@ class Scenario(StrictModel):
     cues: CueSettings | None = None  # GNSS, ranging, barometer
     script: tuple[Segment, ...] = ()
     closed_loop: ClosedLoopSettings = ClosedLoopSettings()  # replaces the script with --closed-loop
-    lidar_gaps_s: tuple[tuple[float, float], ...] = ()  # (from, to): no packet of the LiDAR arrives
+    lidar_gaps_s: tuple[TimeSpan, ...] = ()  # no packet of the LiDAR arrives
     fix_sensor: FixSensorSettings | None = None  # instead of LiDAR and servo: fast, for graphs with SimulatedFixes
     rotation_sensor: RotationSensorSettings | None = None  # instead of cameras, for graphs with SimulatedRotations
     truth_visible: bool = False  # write /truth/visible: the LiDAR's line of sight to each drone

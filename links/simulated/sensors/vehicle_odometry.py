@@ -17,7 +17,7 @@ from pydantic import Field
 from flow.link import Record
 from flow.stage import StrictModel
 from links.simulated.sensors.drift import STEP_S, DriftingEstimate, DriftSettings
-from links.simulated.world.path import Path
+from links.simulated.world.path import Path, TimeSpan
 from links.simulated.world.suspension import SuspendedPath
 from stages.geometry.frames import Array64, quaternions_xyzw
 
@@ -43,7 +43,7 @@ class VehicleOdometrySettings(StrictModel):
     latency_s: float = Field(default=0.004, ge=0, le=1)
     jitter_s: float = Field(default=0.001, ge=0, le=1)  # mean of an exponential distribution
     drift: WheelDriftSettings = WheelDriftSettings()
-    frozen_s: tuple[float, float] | None = None  # (from, to): new stamps with the pose of the first time
+    frozen_s: TimeSpan | None = None  # new stamps with the pose of the first time
 
 
 class VehicleOdometry:

@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cached_property, partial
 from itertools import pairwise
-from typing import Self
+from typing import Annotated, Self
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 from scipy.interpolate import CubicSpline
 
 from flow.stage import StrictModel
@@ -21,6 +21,16 @@ from stages.geometry.frames import Array64
 
 Spline = Callable[[Array64], tuple[Array64, Array64, Array64]]
 """Value, first and second derivative (n, d) at times (n,)."""
+
+
+def _from_before_to(span_s: tuple[float, float]) -> tuple[float, float]:
+    if not span_s[0] < span_s[1]:
+        raise ValueError("a time span is [from, to], with from before to")
+    return span_s
+
+
+TimeSpan = Annotated[tuple[float, float], AfterValidator(_from_before_to)]
+"""(from, to) [s], times after the start."""
 
 
 class Waypoint(StrictModel):

@@ -7,8 +7,10 @@ from pathlib import Path
 import pytest
 
 from flow.config_error import ConfigError
+from flow.link import LinkError
 from links.simulated.matrix.flight_runs import FlightResult, fly_all
 from links.simulated.matrix.flight_table import markdown_table, write_csv
+from links.simulated.rig.run import simulate
 from links.simulated.rig.scenario import load_scenario
 
 ROOT = Path(__file__).parents[4]
@@ -48,6 +50,45 @@ def test_a_wrong_setting_is_an_error_before_the_first_flight(tmp_path: Path) -> 
     with pytest.raises(ConfigError, match=r"--set autopilot\.imu_khz=1.*unknown setting 'imu_khz'"):
         fly(tmp_path, "autopilot.imu_khz=1")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("scenario", "config", "error"),
+    [
+        (
+            "hover_fixes",
+            "estimate",
+            "has a fix_sensor instead of a LiDAR, and the configuration does not take its fixes",
+        ),
+        ("hover_fixes", "sim_flight", "has a fix_sensor instead of a LiDAR"),
+        ("hover", "sim_flight_fixes", "has no fix_sensor, and the configuration takes its fixes"),
+        (
+            "hover",
+            "sim",
+            r"flies on poses of grd \(flight_stack\), and the configuration sends none: wire 'autopilot: ",
+        ),
+        ("../experiment_1", "sim_flight", "no autopilot in the loop, set autopilot.flight_stack"),
+    ],
+)
+def test_a_configuration_that_cannot_fly_a_scenario_is_an_error_before_the_first_flight(
+    scenario: str, config: str, error: str, tmp_path: Path
+) -> None:
+    file, configuration = ROOT / f"configs/scenarios/flight/{scenario}.yaml", ROOT / f"configs/{config}.yaml"
+    with pytest.raises(LinkError, match=error):
+        fly_all([file], SHORT, configuration, range(1, 2), tmp_path / "out", 1, silent)
+    assert not list(tmp_path.iterdir())
+    if config != "sim_flight":  # the command for one flight reports it as well
+        with pytest.raises(LinkError, match=error):
+            simulate(file, tmp_path / "x.mcap", closed_loop=configuration)
+        assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "setting", ["vehicle_odometry.frozen_s=[5, 1]", "lidar_gaps_s=[[2, 2]]", "closed_loop.killed_s=[5, 1]"]
+)
+def test_a_time_span_that_ends_before_it_begins_is_an_error(setting: str) -> None:
+    with pytest.raises(ConfigError, match=r"a time span is \[from, to\], with from before to, got \["):
+        load_scenario(HOVER, [setting])
 
 
 @pytest.mark.parametrize("scenario", MATRIX, ids=lambda file: file.stem)

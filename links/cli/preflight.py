@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 from rich.text import Text
 
+from flow.graph import Graph
 from flow.link import LinkError
 from links.cli.console import EXIT_FAILED, err, out, progress_bar, report_errors, warn
 from links.cli.options import Config, HostName, HostsFile, Overlay, Sets, place_of
@@ -71,6 +72,7 @@ def preflight(
     place = place_of(hosts, host)
     if recording is None:
         whole = live_graph(request)
+        _warn_left_out(whole)
         graph = whole if place is None else host_graph(whole, *place, to_run=True)
         results = _print_results(preflight_live(graph, for_s, _wait, _ask if motion else None, step_s, out_dir, whole))
     elif place is not None:
@@ -91,6 +93,7 @@ def preflight(
 def _on_recording(request: RunRequest, recording: Path, motion: bool) -> list[CheckResult]:
     session = Session(recording)
     graph = request.graph(session.rig_yaml, f"{recording} (rig.yaml)")
+    _warn_left_out(graph)
     with progress_bar(f"replay {recording.name}") as step:
         results = list(preflight_recording(graph, session, motion, step))
     for text in session.warnings:
@@ -98,6 +101,12 @@ def _on_recording(request: RunRequest, recording: Path, motion: bool) -> list[Ch
     if len(session.parts) > 1:
         out.print(f"{len(session.parts)} parts of the recording, checked together")
     return _print_results(iter(results))
+
+
+def _warn_left_out(graph: Graph) -> None:
+    """Without cameras in the rig no camera is checked."""
+    for text in graph.left_out_texts():
+        warn(text)
 
 
 def _print_results(results: Iterator[CheckResult]) -> list[CheckResult]:

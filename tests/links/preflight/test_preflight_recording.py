@@ -33,6 +33,12 @@ def test_a_flight_with_every_sensor_is_go():
     assert "GO: " in text
 
 
+def test_what_a_rig_without_cameras_leaves_out_is_a_warning():
+    recording = ROOT / "recordings" / "street_sweep.mcap"
+    text = grd(ROOT / "configs" / "vision.yaml", "--recording", recording, "--no-motion", code=1)
+    assert "warning: the configuration has no $rig.cameras: vp_vehicle, vp_drone, ego, drone_odometry, align" in text
+
+
 def test_a_recording_without_autopilot_is_no_go_where_the_configuration_declares_one():
     recording = ROOT / "recordings" / "street_sweep.mcap"
     text = grd(ROOT / "configs" / "estimate.yaml", "--recording", recording, "--no-motion", code=1)

@@ -6,7 +6,7 @@ Source: ours.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -94,9 +94,10 @@ def _config(tree: Tree, path: KeyPath, cls: type[Node[Any]], declared: Any) -> d
 
 def _takes_rig(declared: Any) -> bool:
     """Whether settings refer to the rig."""
-    if isinstance(declared, dict | list):
-        inner = declared.values() if isinstance(declared, dict) else declared
-        return any(_takes_rig(value) for value in cast("Iterable[Any]", inner))
+    if isinstance(declared, dict):
+        return any(map(_takes_rig, cast("dict[str, Any]", declared).values()))
+    if isinstance(declared, list):
+        return any(map(_takes_rig, cast("list[Any]", declared)))
     return isinstance(declared, str) and bool(_OF_RIG.match(declared))
 
 

@@ -36,7 +36,8 @@ def check_values(tree: Tree, path: KeyPath, model: type[BaseModel], values: Any,
             alternatives.setdefault(_path_of(error, cast("dict[str, Any]", values)), []).append(error)
         for inner, found in alternatives.items():
             where = (*path, *inner)
-            location = tree.last_location(where) if isinstance(found[0]["input"], dict) else None
+            of_mapping = found[0]["type"] == "value_error" and isinstance(found[0]["input"], dict)
+            location = tree.last_location(where) if of_mapping else None
             tree.error(where, _text(found, inner, model, owner), location)
 
 
@@ -66,7 +67,8 @@ def _text(errors: list[Any], path: KeyPath, model: type[BaseModel], owner: str) 
         return "is missing and has no default."
     text = " or ".join(dict.fromkeys(_requirement(error) for error in errors))
     value = error["input"]
-    return f"{text}." if isinstance(value, dict) or repr(value) in text else f"{text}, got {value!r}."
+    is_shown = isinstance(value, dict) or (isinstance(value, str) and repr(value) in text)
+    return f"{text}." if is_shown else f"{text}, got {value!r}."
 
 
 def _requirement(error: Any) -> str:

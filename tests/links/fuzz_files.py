@@ -10,13 +10,13 @@ from typing import Any, cast
 import yaml
 
 from flow.config_error import ConfigError
-from flow.graph import load_graph
 from flow.link import LinkError
 from links.cli.files import read_rig
 from links.evaluation.text_files import read_tum
 from links.importing import import_file
 from links.importing.lens import read_lens
 from links.runs import as_live
+from links.runs.request import RunRequest
 from tests.links.importing.captures import ethernet, pcap, udp
 from tests.links.importing.test_import_tlog import frames, tlog
 from tests.links.runs.test_foreign_recordings import RIGS, configuration
@@ -42,7 +42,7 @@ def files(folder: Path) -> list[File]:
     estimate = ROOT / "configs" / "estimate.yaml"
 
     def take_rig(data: bytes) -> object:
-        return load_graph(estimate, sections={"rig": (data.decode(errors="replace"), "flight.mcap (rig.yaml)")})
+        return RunRequest(estimate).graph(data.decode(errors="replace"), "flight.mcap (rig.yaml)")
 
     def take_config(data: bytes) -> object:
         session = SimpleNamespace(config_yaml=data.decode(errors="replace"), path=Path("flight.mcap"))

@@ -57,6 +57,7 @@ class Toy(StrictModel):
         ({"points": 3}, "toy.points: must be a list, got 3."),
         ({"drone": [1]}, "toy.drone: must be a mapping of settings, got [1]."),
         ({"drone": {"span_m": -1}}, "toy.drone.span_m: must be greater than 0, got -1."),
+        ({"drone": {"span_m": 0}}, "toy.drone.span_m: must be greater than 0, got 0."),
         ({"drone": {"span": 1}}, "toy.drone.span: unknown setting 'span'. Did you mean 'span_m'?"),
         ({"drone": {"x": 1}}, "toy.drone.x: unknown setting 'x'. Toy.drone has 'span_m'."),
         ({"body": {"shape": "flat"}}, "toy.body: 'shape' must be 'round' or 'square', not 'flat'."),

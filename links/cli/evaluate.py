@@ -90,7 +90,7 @@ def evaluate_runs(
     fault (false outputs, an overconfident covariance, a wrong yaw branch, no output at all). RUNS of several
     configurations are side by side; each of several drones is evaluated with the tracks that follow it.
 
-    Example: grd evaluate out/street_sweep-replay --against out/street_sweep-paper --report out/compare.html
+    Example: grd evaluate out/street_sweep-estimate --against out/street_sweep-paper --report out/compare.html
     """
     _check_installed()
     if tables := [path for path in runs if path.suffix == PARQUET]:

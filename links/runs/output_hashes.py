@@ -22,6 +22,7 @@ from flow.link import TRUTH_TOPICS, LinkError, Tap
 from flow.replay import replay
 from flow.taps import Digest
 from links.recording import Session
+from links.runs.request import RunRequest
 
 HASHES_FILE = "hashes.json"
 CONFIGS = ("replay", "paper", "estimate")  # of configs/; pinned for every recording
@@ -109,18 +110,17 @@ def measure(pins: list[Pin], jobs: int) -> Iterator[PinResult]:
 def output_hash(recording: Path, config: Path) -> str:
     """Replay a recording through a configuration without its taps, in one process, every array checked."""
     session = Session(recording)
-    sections = None if session.rig_yaml is None else {"rig": (session.rig_yaml, f"{recording} (rig.yaml)")}
-    graph = load_graph(config, [], _without_taps(config), sections)
+    graph = RunRequest(config, sets=_without_taps(config)).graph_on(session)
     digest = Digest()
     records = (record for record in session.records() if not record.topic.startswith(TRUTH_TOPICS))
     replay(graph, records, [digest], strict=True)
     return digest.hexdigest()
 
 
-def _without_taps(config: Path) -> list[str]:
+def _without_taps(config: Path) -> tuple[str, ...]:
     """Settings that disable the taps of a configuration: the viewer takes half the time of a replay."""
     graph = load_graph(config, [], [], None)
-    return [f"links.{spec.name}=null" for spec in graph.nodes.values() if issubclass(spec.cls, Tap)]
+    return tuple(f"links.{spec.name}=null" for spec in graph.nodes.values() if issubclass(spec.cls, Tap))
 
 
 def _has_cameras(recording: Path) -> bool:

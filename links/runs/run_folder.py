@@ -228,7 +228,7 @@ def replay_into(
     """
     started_s = time.monotonic()
     session = Session(recording)
-    graph = request.graph(session.rig_yaml, f"{recording} (rig.yaml)")
+    graph = request.graph_on(session)
     truth, digest = read_truth_file(recording), Digest() if hashed else None
     clock_warnings = clock_differences(graph, session.config_yaml)
     with RunFolder(folder, recording, request, graph, started_s) as run:
@@ -303,7 +303,7 @@ class ReplayOutcome:
 
 def replay_all(
     recordings: Sequence[Path],
-    request: RunRequest,
+    requests: Sequence[RunRequest],
     out_dir: Path,
     workers: Workers,
     progress: Callable[[float, float], None],
@@ -311,7 +311,7 @@ def replay_all(
     single_process: bool = False,
     hashed: bool = True,
 ) -> list[ReplayOutcome]:
-    """Replay into `out_dir/<recording>-<configuration>`. LinkError: two recordings have one name.
+    """Replay each with its request into `out_dir/<recording>-<configuration>`. LinkError: two recordings have one name.
 
     `single_process`, `hashed`: as in `replay_into`.
     """
@@ -320,7 +320,7 @@ def replay_all(
         raise LinkError(f"several recordings are named {twice[0]}: their runs would share a folder; give each --out")
     tasks = [
         ReplayTask(path, out_dir / f"{path.stem}-{request.config.stem}", request, hashed, single_process)
-        for path in recordings
+        for path, request in zip(recordings, requests, strict=True)
     ]
     return run_all(replay_one, tasks, workers, lambda shares: progress(sum(shares), len(tasks)))
 
@@ -328,7 +328,7 @@ def replay_all(
 def replay_one(task: ReplayTask, report: Callable[[float], None]) -> ReplayOutcome:
     """Replay one recording, unless its folder holds the run. A folder with another run is not changed."""
     try:
-        graph = task.request.graph(Session(task.recording).rig_yaml, f"{task.recording} (rig.yaml)")
+        graph = task.request.graph_on(Session(task.recording))
         if holds_run(task.folder, task.recording, graph):
             summary = json.loads((task.folder / SUMMARY_FILE).read_text(encoding="utf-8"))
             return ReplayOutcome(task.recording, task.folder, summary["output_hash"], kept=True)

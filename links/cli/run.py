@@ -97,7 +97,8 @@ def run(
     """Run CONFIG live, or over the recording that its `replay:` names.
 
     A live run is recorded (`links.recording.Recorder`); Ctrl-C or SIGTERM ends it. Exit code 1 when a stage stopped
-    the run or was switched off after repeated errors, when no sensor sent anything, or no drone was found.
+    the run; live also when a stage was switched off after repeated errors, no sensor sent anything, or no drone was
+    found; of a recording also when none of its records was decoded.
 
     Example: grd run configs/quickstart.yaml --against configs/quickstart_paper.yaml
     """
@@ -154,7 +155,8 @@ def replay_recording(
     """Replay RECORDING, deterministic and as fast as possible.
 
     Several recordings are replayed into folders of --out [default: out], on --jobs processes or the workers of
-    --scheduler; complete runs with the same settings are kept.
+    --scheduler; complete runs with the same settings are kept. Exit code 1 when a stage failed, or when no record was
+    decoded.
 
     The first part of a split recording stands for all parts; a later part is replayed alone. --expect takes a whole
     output hash or its first 16 digits: those cover the values, the rest covers the reason texts. With --as-live each
@@ -187,9 +189,7 @@ def replay_recording(
         raise typer.Exit(EXIT_FAILED)
 
 
-def _request(
-    recording: Path, config: Path | None, overlays: list[Path] | None, sets: list[str] | None
-) -> RunRequest:
+def _request(recording: Path, config: Path | None, overlays: list[Path] | None, sets: list[str] | None) -> RunRequest:
     """The request for a recording; `config` None: the configuration that fits it."""
     changes = tuple(overlays or ()), tuple(sets or ())
     return fitting_request(recording, *changes) if config is None else RunRequest(config, *changes)

@@ -12,7 +12,7 @@ import typer
 from rich.table import Table
 
 from flow.link import LinkError
-from links.cli.console import check_new, out, progress_bar, report_errors, show_table, warn
+from links.cli.console import check_output, out, progress_bar, report_errors, show_table, warn
 from links.cli.files import read_rig
 
 MAX_FACT_CHARACTERS = 200
@@ -36,7 +36,7 @@ def info(
     if mapping is not None:
         if found.mapping is None:
             raise LinkError(f"{file} is no ROS bag: only a bag has a mapping")
-        check_new(mapping, "--map", overwrite=overwrite)
+        check_output(mapping, "--map", overwrite=overwrite)
     for name, text in found.facts:
         short = text if len(text) <= MAX_FACT_CHARACTERS else f"{text[:MAX_FACT_CHARACTERS]} ..."
         out.print(f"{name}: {short}", markup=False)

@@ -50,9 +50,8 @@ class RunRequest:
         if rig_yaml is None and "rig" in load_tree(self.config).values:
             rig_yaml = NO_RIG
             if not self.rig_on(session):
-                raise LinkError(
-                    "; ".join([f"{session.path} has no rig: give that of its vehicle with --overlay", *session.warnings])
-                )
+                text = f"{session.path} has no rig: give that of its vehicle with --overlay"
+                raise LinkError("; ".join([text, *session.warnings]))
         return self.graph(rig_yaml, f"{session.path} (rig.yaml)")
 
     def rig_on(self, session: Session) -> dict[str, Any]:

@@ -29,6 +29,7 @@ from stages.geometry.frames import Array64
 from stages.kernels.geometry.lens import ANGLE_SERIES, OCAM, polynomial_kernel, project, rho_of_theta, series, unproject
 
 Pixel = tuple[float, float]
+FocalPx = Annotated[float, Field(gt=0)]
 
 WIDEST_RHO = 20.0  # focal lengths; no image circle is wider
 
@@ -87,7 +88,7 @@ class Equidistant(_Lens):
     """r = f theta: the ideal fisheye."""
 
     model: Literal["equidistant"] = "equidistant"
-    focal_px: float = Field(gt=0)
+    focal_px: FocalPx
 
     def _radial(self) -> tuple[int, Array64]:
         return ANGLE_SERIES, np.array([1.0, 0.0, 0.0, 0.0, 0.0])
@@ -106,7 +107,7 @@ class KannalaBrandt(_Lens):
     """r = f (theta + k1 theta^3 + k2 theta^5 + k3 theta^7 + k4 theta^9)."""
 
     model: Literal["kannala_brandt"] = "kannala_brandt"
-    focal_px: Pixel  # fx, fy
+    focal_px: tuple[FocalPx, FocalPx]  # fx, fy
     k: tuple[float, float, float, float]
 
     def _radial(self) -> tuple[int, Array64]:

@@ -99,14 +99,13 @@ def evaluate_runs(
         return
     if no_drone and truth is not None:
         raise LinkError("--no-drone and --truth contradict each other: give one of them")
-    from links.cli.evaluate_output import Files, compare_and_show, evaluate_all, prepare
+    from links.cli.evaluate_output import Files, compare_and_show, evaluate_all, prepared
     from links.evaluation.groups import parse_by
 
     keys = [parse_by(text) for text in by or []]
     limits = EvaluationLimits(max_gap_s=max_gap_s, max_age_s=max_age_s, reach_m=reach_m)
     numbers = out_dir / JSON_FILE if out_dir else report and report.parent / JSON_FILE
-    files = Files(numbers, report, csv_file, parquet_file, tables_file)
-    prepare(files)
+    files = prepared(Files(numbers, report, csv_file, parquet_file, tables_file))
     own, compared = evaluate_all(runs, against or [], truth, no_drone, limits, scheduler or jobs)
     compare_and_show(own, compared, keys, files)
     if any(e.findings for e in own):

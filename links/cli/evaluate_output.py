@@ -95,13 +95,14 @@ def evaluate_all(
     return [e for part in own for e in part], [e for part in others for e in part]
 
 
-def prepare(files: Files) -> None:
-    """Make the folders of the files, before the evaluation. LinkError when one cannot be written."""
+def prepared(files: Files) -> Files:
+    """The same files after their folders were made. LinkError when one cannot be written."""
     options = ("--out", "--report", "--csv", "--parquet", "--paper-tables")
     for option, file in zip(options, astuple(files), strict=True):
         if file is not None:
             file.parent.mkdir(parents=True, exist_ok=True)
             check_output(file, option, overwrite=True)
+    return files
 
 
 def compare_and_show(own: list[Evaluation], others: list[Evaluation], keys: list[Key], files: Files) -> None:

@@ -30,6 +30,15 @@ from links.runs.shipped import shipped_all, shipped_option
 from links.runs.warm_up import warm_up, warm_up_graph
 from links.zenoh import host_graph
 
+ReplayConfig = Annotated[
+    Path | None,
+    typer.Option(
+        "--config",
+        callback=shipped_option,
+        help="Configuration [default: configs/vision.yaml if the rig in RECORDING has cameras, otherwise "
+        "configs/estimate.yaml].",
+    ),
+]
 AsLive = Annotated[
     bool,
     typer.Option(
@@ -131,15 +140,7 @@ def replay_recording(
             help="A .mcap recording (`grd import` converts a .pcap or .tlog), or several.",
         ),
     ],
-    config: Annotated[
-        Path | None,
-        typer.Option(
-            "--config",
-            callback=shipped_option,
-            help="Configuration [default: configs/vision.yaml if the rig in RECORDING has cameras, otherwise "
-            "configs/estimate.yaml].",
-        ),
-    ] = None,
+    config: ReplayConfig = None,
     out_dir: Out = None,
     overlay: Overlay = None,
     sets: Sets = None,

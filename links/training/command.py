@@ -26,6 +26,10 @@ if TYPE_CHECKING:
 LISTED_RUNS = 8
 LIBRARIES = ("numpy", "scipy", "pandas")
 
+Without = Annotated[
+    list[str] | None, typer.Option("--without", help="Feature that the model does not use; repeatable.")
+]
+
 
 @report_errors
 def train_detector(
@@ -37,9 +41,7 @@ def train_detector(
         list[Path] | None,
         typer.Option("--held-out", help="Folder of runs that are scored and not trained on; repeatable."),
     ] = None,
-    left_out: Annotated[
-        list[str] | None, typer.Option("--without", help="Feature that the model does not use; repeatable.")
-    ] = None,
+    left_out: Without = None,
     start_file: Annotated[
         Path | None,
         typer.Option("--start", help="Weights file of an earlier training: the runs change it as far as they differ."),

@@ -15,8 +15,9 @@ from rich.table import Table
 from rich.text import Text
 
 from flow.link import LinkError
-from links.cli.console import EXIT_FAILED, check_new, err, out, progress_bar, report_errors, show_table, warn
+from links.cli.console import EXIT_FAILED, check_output, err, out, progress_bar, report_errors, show_table, warn
 from links.cli.files import Overwrite, read_rig
+from links.recording.writer import beside
 
 if TYPE_CHECKING:  # scipy and numba are imported when the command runs
     from links.calibration import Gathered
@@ -87,11 +88,11 @@ def calibrate_recording(
     from stages.calibration.calibrate import CannotCalibrate
     from stages.calibration.levelling import Standing, stand
 
-    target = out_file or recording.with_suffix(".rig.yaml")
+    target = out_file or beside(recording, ".rig.yaml")
     if target.suffix not in (".yaml", ".yml"):
         raise LinkError(f"{target}: a rig file ends in .yaml")
     for file in (target, target.with_suffix(".svg")):
-        check_new(file, "--out", overwrite=overwrite)
+        check_output(file, "--out", overwrite=overwrite)
     if to_s is not None and to_s <= from_s:
         raise LinkError(f"--to {to_s:g} is not after --from {from_s:g}")
     with progress_bar(f"read {recording.name}") as step:

@@ -6,6 +6,7 @@ Source: ours.
 from __future__ import annotations
 
 import functools
+import os
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -129,10 +130,16 @@ def warn(text: str) -> None:
     err.print(f"warning: {text}", markup=False, style="yellow")
 
 
-def check_new(file: Path, option: str, *, overwrite: bool) -> None:
-    """LinkError when an output file exists and must not be overwritten; `option` names another file."""
+def check_output(file: Path, option: str, *, overwrite: bool) -> None:
+    """LinkError when a file cannot be written, or exists and must not be overwritten; `option` names another file."""
+    if file.is_dir():
+        raise LinkError(f"{file} is a folder: name a file with {option}")
     if file.exists() and not overwrite:
         raise LinkError(f"{file} exists already: give another name with {option}, or --overwrite")
+    if not file.parent.is_dir():
+        raise LinkError(f"{file}: there is no folder {file.parent}: create it first, or name another with {option}")
+    if not os.access(file if file.exists() else file.parent, os.W_OK):
+        raise LinkError(f"{file} cannot be written: name another with {option}")
 
 
 def show_table(table: Table) -> None:

@@ -90,7 +90,7 @@ def evaluate_runs(
     fault (false outputs, an overconfident covariance, a wrong yaw branch, no output at all). RUNS of several
     configurations are side by side; each of several drones is evaluated with the tracks that follow it.
 
-    Example: grd evaluate out/street_sweep-replay --against out/street_sweep-paper --report out/compare.html
+    Example: grd evaluate out/street_sweep-estimate --against out/street_sweep-paper --report out/compare.html
     """
     _check_installed()
     if tables := [path for path in runs if path.suffix == PARQUET]:
@@ -99,14 +99,14 @@ def evaluate_runs(
         return
     if no_drone and truth is not None:
         raise LinkError("--no-drone and --truth contradict each other: give one of them")
-    from links.cli.evaluate_output import Files, compare_and_show, evaluate_all
+    from links.cli.evaluate_output import Files, compare_and_show, evaluate_all, prepared
     from links.evaluation.groups import parse_by
 
     keys = [parse_by(text) for text in by or []]
     limits = EvaluationLimits(max_gap_s=max_gap_s, max_age_s=max_age_s, reach_m=reach_m)
+    numbers = out_dir / JSON_FILE if out_dir else report and report.parent / JSON_FILE
+    files = prepared(Files(numbers, report, csv_file, parquet_file, tables_file))
     own, compared = evaluate_all(runs, against or [], truth, no_drone, limits, scheduler or jobs)
-    numbers = out_dir / JSON_FILE if out_dir else report and report.with_name(JSON_FILE)
-    files = Files(numbers, report, csv_file, parquet_file, tables_file)
     compare_and_show(own, compared, keys, files)
     if any(e.findings for e in own):
         raise typer.Exit(EXIT_FAILED)

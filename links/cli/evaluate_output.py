@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
 
 import pandas as pd
 
 from flow.jobs import Workers, run_all
 from flow.link import LinkError
-from links.cli.console import err, out, progress_bar, show_table, warn
+from links.cli.console import check_output, err, out, progress_bar, show_table, warn
 from links.evaluation.association import EvaluationLimits
 from links.evaluation.comparison import (
     Pair,
@@ -95,6 +95,16 @@ def evaluate_all(
     return [e for part in own for e in part], [e for part in others for e in part]
 
 
+def prepared(files: Files) -> Files:
+    """The same files after their folders were made. LinkError when one cannot be written."""
+    options = ("--out", "--report", "--csv", "--parquet", "--paper-tables")
+    for option, file in zip(options, astuple(files), strict=True):
+        if file is not None:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            check_output(file, option, overwrite=True)
+    return files
+
+
 def compare_and_show(own: list[Evaluation], others: list[Evaluation], keys: list[Key], files: Files) -> None:
     """Print the tables and write the files. Without `keys` the tables of single runs are printed, too."""
     pairs, warnings = pair_up(own, others) if others else ([], [])
@@ -112,13 +122,13 @@ def compare_and_show(own: list[Evaluation], others: list[Evaluation], keys: list
         _show(own, pairs)
     if files.numbers is not None:
         text = json.dumps(as_json(own, pairs, warnings), indent=2, allow_nan=False)
-        _made(files.numbers).write_text(text + "\n", encoding="utf-8")
+        files.numbers.write_text(text + "\n", encoding="utf-8")
     if files.report is not None:
-        write_report(_made(files.report), own, others, pairs, warnings, summaries)
+        write_report(files.report, own, others, pairs, warnings, summaries)
     if files.csv is not None:
-        write_csv(_made(files.csv), own)
+        write_csv(files.csv, own)
     if files.parquet is not None:
-        write_parquet(_made(files.parquet), own)
+        write_parquet(files.parquet, own)
     named = (
         ("numbers", files.numbers),
         ("report", files.report),
@@ -140,12 +150,6 @@ def show_tables(files: list[Path], keys: list[Key]) -> None:
     for table in [*tables, *([false_track_table(empty)] if len(empty) else [])]:
         show_table(table.rich())
         out.print(table.note, markup=False)
-
-
-def _made(file: Path) -> Path:
-    """The file, after its folder was made."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    return file
 
 
 def _summaries(own: list[Evaluation], keys: list[Key]) -> list[Table]:
@@ -173,7 +177,7 @@ def _paper_tables(file: Path, own: list[Evaluation]) -> list[Table]:
             "--paper-tables: no run is of a recording named experiment_1 ... experiment_4, nor of one with a suffix "
             "(experiment_1-s1)"
         )
-    _made(file).write_text(markdown(tables), encoding="utf-8")
+    file.write_text(markdown(tables), encoding="utf-8")
     return tables
 
 
@@ -201,5 +205,5 @@ def _by_text(own: list[Evaluation], texts: Callable[[Evaluation], list[str]]) ->
     for e in own:
         for text in texts(e):
             found.setdefault(text, []).append(label(e))
-    everything = f"all {len(own)} runs"
+    everything = f"all {len(own)} {'runs' if len(own) == len({e.run.name for e in own}) else 'outputs'}"
     return [(text, everything if 1 < len(own) == len(names) else some_of(names)) for text, names in found.items()]

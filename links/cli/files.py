@@ -17,7 +17,7 @@ from flow.config.tree import Tree, load_tree
 from flow.config.yaml_text import YamlTextError, yaml_values
 from flow.config_error import ConfigError, Location
 from flow.link import LinkError
-from links.cli.console import EXIT_FAILED, check_new, err, out, progress_bar, report_errors, warn
+from links.cli.console import EXIT_FAILED, check_output, err, out, progress_bar, report_errors, warn
 from stages.geometry.rig import Rig
 
 MAX_RIG_BYTES = 100_000
@@ -43,7 +43,8 @@ def import_recording(
         ),
     ] = None,
     port: Annotated[
-        int | None, typer.Option("--port", help="UDP port of the LiDAR's data packets [default: the model's].")
+        int | None,
+        typer.Option("--port", min=1, max=65535, help="UDP port of the LiDAR's data packets [default: the model's]."),
     ] = None,
     sender: Annotated[
         str | None, typer.Option("--sender", help="IPv4 address of the LiDAR, if there are several.")
@@ -90,7 +91,7 @@ def _import_beams(file: Path, out_file: Path | None, overwrite: bool) -> None:
     """Write the model and the beams in a manufacturer's file as a rig file."""
     lidar = _lidar_of(file)
     target = out_file or file.with_suffix(".yaml")
-    check_new(target, "-o", overwrite=overwrite)
+    check_output(target, "-o", overwrite=overwrite)
     target.write_text(
         yaml.safe_dump({"rig": {"lidar": lidar}}, sort_keys=False, default_flow_style=None, width=120), encoding="utf-8"
     )
@@ -112,11 +113,7 @@ def _lidar_of(file: Path) -> dict[str, Any]:
     from links.lidar import hesai_beams, ouster_beams
 
     text = file.read_text(encoding="utf-8", errors="replace")
-    if file.suffix == ".json":
-        model, beams = ouster_beams(text, str(file))
-    else:
-        beams = hesai_beams(text, str(file))
-        model = f"XT{len(beams.elevation_deg)}"
+    model, beams = (ouster_beams if file.suffix == ".json" else hesai_beams)(text, str(file))
     return {"model": model, "beams": beams.model_dump(mode="json")}
 
 
@@ -200,6 +197,8 @@ def _rrd_of(run: Path | None) -> Path:
             raise LinkError("out/ holds no run with a run.rrd: name the folder of a run, or: grd run quickstart")
         out.print(f"the newest run: {found[-1]}", markup=False)
         return found[-1]
+    if run.suffix == ".mcap":
+        raise LinkError(f"{run} is a recording: grd replay {run} --view")
     if not run.is_dir():
         return run
     file = next(iter(sorted(run.glob("*.rrd"))), None)
@@ -237,6 +236,7 @@ def view(
             raise LinkError("--tab selects the tab of an image: add --screenshot FILE.png")
         show(rrd)
         return
+    check_output(png, "--screenshot", overwrite=True)
     errors = screenshot(rrd, png, at=at, tab=tab, size=size)
     for text in errors:
         err.print(text, markup=False, style="red")

@@ -36,11 +36,11 @@ SHOWN = (RelativePose, DroneFix, TrackState)
 
 
 class LatestMessages(Tap):
-    """Keeps the newest message of each kind that the console shows."""
+    """Keeps the newest message of each kind that the console shows, by the stage that published it."""
 
     def __init__(self) -> None:
         super().__init__()
-        self._messages: dict[type[Message], Any] = {}
+        self._messages: dict[type[Message], dict[str, Any]] = {kind: {} for kind in SHOWN}
 
     def wants(self, message: type[Message]) -> bool:
         """Only messages that the console shows."""
@@ -48,17 +48,24 @@ class LatestMessages(Tap):
 
     def see(self, output: str, message: Message, arrival_ns: int) -> None:
         """Store the message."""
-        self._messages[type(message)] = message
+        self._messages[type(message)][output.partition(".")[0]] = message
 
-    def state_and_pose(self) -> tuple[str, str]:
-        """Texts of the state and the pose: those of the fused pose, without one those of the track and its last fix."""
-        pose: RelativePose | None = self._messages.get(RelativePose)
-        if pose is not None:
-            return f"{pose.state.name}: {pose.reason}", _pose(pose)
-        track: TrackState | None = self._messages.get(TrackState)
-        fix: DroneFix | None = self._messages.get(DroneFix)
-        state = "no drone yet" if track is None else f"{track.state.name}: {track.reason}"
-        return state, "" if fix is None else _position(fix.xyz_vehicle_m, fix.covariance_m2)
+    def states_and_poses(self) -> list[tuple[str, str]]:
+        """Texts of state and pose of each drone: of its fused pose, without one of its track and its last fix.
+
+        Those of several drones begin with the name of the stage.
+        """
+        poses: dict[str, RelativePose] = self._messages[RelativePose]
+        tracks: dict[str, TrackState] = self._messages[TrackState]
+        fixes: dict[str, DroneFix] = self._messages[DroneFix]
+        texts = {name: (f"{pose.state.name}: {pose.reason}", _pose(pose)) for name, pose in poses.items()}
+        for name in () if poses else sorted(tracks.keys() | fixes.keys()):
+            track, fix = tracks.get(name), fixes.get(name)
+            state = "no drone yet" if track is None else f"{track.state.name}: {track.reason}"
+            texts[name] = state, "" if fix is None else _position(fix.xyz_vehicle_m, fix.covariance_m2)
+        if len(texts) > 1:
+            return [(f"{name} {state}", pose) for name, (state, pose) in sorted(texts.items())]
+        return list(texts.values()) or [("no drone yet", "")]
 
 
 def _pose(pose: RelativePose) -> str:
@@ -141,18 +148,18 @@ class LiveView:
 
     def _line(self, status: RunStatus) -> str:
         report = status.report()
-        state, pose = self.latest.state_and_pose()
+        drones = [text for drone in self.latest.states_and_poses() for text in drone]
         closed = [f"{n} {link.state_text}" for n, link in report.links.items() if link.state is not LinkState.OPEN]
-        parts = [f"{status.elapsed_s:.1f} s", state, pose, _numbers(report), *closed]
+        parts = [f"{status.elapsed_s:.1f} s", *drones, _numbers(report), *closed]
         return "; ".join(part for part in parts if part)
 
     def _table(self, status: RunStatus, now_s: float) -> Group:
         report = status.report()
         self._rates.add(now_s, {name: link.records for name, link in report.links.items()})
-        state, pose = self.latest.state_and_pose()
-        lines = [f"{status.elapsed_s:8.1f} s   {state}", f"             {pose or 'no position'}"]
-        lines += [f"             {sent}"] if (sent := _to_autopilot(report)) else []
-        lines += [f"             {text}" for text in (_numbers(report), status.used) if text]
+        texts = [text for state, pose in self.latest.states_and_poses() for text in (state, pose or "no position")]
+        texts += [*_to_autopilots(report), _numbers(report), status.used]
+        times = [f"{status.elapsed_s:8.1f} s", *([""] * len(texts))]
+        lines = [f"{time:10}   {text}" for time, text in zip(times, filter(None, texts), strict=False)]
         parts: list[RenderableType] = [Text(line, no_wrap=True) for line in lines]
         parts += [self._sources(report, now_s), *_edges(report)]
         others = [
@@ -198,14 +205,15 @@ def _edges(report: LiveReport) -> list[RenderableType]:
     return [table]
 
 
-def _to_autopilot(report: LiveReport) -> str:
-    """How many poses were sent to the autopilot, and how many held back, by reason; empty without an autopilot."""
-    for counts in report.counters.values():
+def _to_autopilots(report: LiveReport) -> list[str]:
+    """How many poses were sent to each autopilot, and how many held back, by reason."""
+    texts: dict[str, str] = {}
+    for name, counts in report.counters.items():
         sent = {kind: n for kind, n in counts.groups.get(SENT, {}).items() if kind in POSE_MESSAGES}
         rejected = counts.groups.get(POSE_REJECTED, {})
         if sent or rejected:
-            return f"to the autopilot: {_counts(sent) or 'nothing sent'}; held back: {_counts(rejected) or 'none'}"
-    return ""
+            texts[name] = f"{_counts(sent) or 'nothing sent'}; held back: {_counts(rejected) or 'none'}"
+    return [f"to {name if len(texts) > 1 else 'the autopilot'}: {text}" for name, text in texts.items()]
 
 
 def _counts(counts: Mapping[str, int]) -> str:

@@ -92,7 +92,7 @@ def preflight(
 
 def _on_recording(request: RunRequest, recording: Path, motion: bool) -> list[CheckResult]:
     session = Session(recording)
-    graph = request.graph(session.rig_yaml, f"{recording} (rig.yaml)")
+    graph = request.graph_on(session)
     _warn_left_out(graph)
     with progress_bar(f"replay {recording.name}") as step:
         results = list(preflight_recording(graph, session, motion, step))

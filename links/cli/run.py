@@ -23,15 +23,22 @@ from links.preflight.shipped_values import shipped_values
 from links.runs.as_live import rerun_into
 from links.runs.live_run import live_graph, run_live
 from links.runs.output_hashes import hash_matches
-from links.runs.request import RunRequest, RunResult
+from links.runs.request import RunRequest, RunResult, fitting_request
 from links.runs.results import SUMMARY_FILE
 from links.runs.run_folder import replay_all, replay_into
-from links.runs.shipped import CONFIGS, shipped_all, shipped_option
+from links.runs.shipped import shipped_all, shipped_option
 from links.runs.warm_up import warm_up, warm_up_graph
 from links.zenoh import host_graph
 
-DEFAULT_REPLAY_CONFIG = CONFIGS / "replay.yaml"
-
+ReplayConfig = Annotated[
+    Path | None,
+    typer.Option(
+        "--config",
+        callback=shipped_option,
+        help="Configuration [default: configs/vision.yaml if the rig in RECORDING has cameras, otherwise "
+        "configs/estimate.yaml].",
+    ),
+]
 AsLive = Annotated[
     bool,
     typer.Option(
@@ -99,26 +106,27 @@ def run(
     """Run CONFIG live, or over the recording that its `replay:` names.
 
     A live run is recorded (`links.recording.Recorder`); Ctrl-C or SIGTERM ends it. Exit code 1 when a stage stopped
-    the run or was switched off after repeated errors, when no sensor sent anything, or no drone was found.
+    the run; live also when a stage was switched off after repeated errors, no sensor sent anything, or no drone was
+    found; of a recording also when none of its records was decoded.
 
     Example: grd run configs/quickstart.yaml --against configs/quickstart_paper.yaml
     """
     if config.suffix == ".mcap":
         raise LinkError(f"{config} is a recording: grd replay {config}")
     recording = recording_named(config, overlay or (), sets or ())
+    request = RunRequest(config, tuple(overlay or ()), tuple(sets or ()))
     place = place_of(hosts, host)
     if recording is not None:
         if for_s is not None or place is not None:
             option = "--for" if for_s is not None else "--hosts"
             raise LinkError(f"{option} is for live runs, and {config} replays {recording.name}: leave it out")
-        result = _run(recording, config, out_dir, overlay or [], sets or [], view)
+        result = _run(recording, request, out_dir, view)
         if against is not None:
             other = _run_against(against, recording, out_dir)
             show_table(side_by_side([(config.stem, result), (against.stem, other)]))
         return
     if against is not None:
         raise LinkError(f"--against is for a configuration that replays a recording, and {config} runs live")
-    request = RunRequest(config, tuple(overlay or ()), tuple(sets or ()))
     _run_live(request, _new_folder(out_dir, f"live-{config.stem}"), for_s, warm, hashed, place, view)
 
 
@@ -132,10 +140,7 @@ def replay_recording(
             help="A .mcap recording (`grd import` converts a .pcap or .tlog), or several.",
         ),
     ],
-    config: Annotated[
-        Path | None,
-        typer.Option("--config", callback=shipped_option, help="Configuration [default: configs/replay.yaml]."),
-    ] = None,
+    config: ReplayConfig = None,
     out_dir: Out = None,
     overlay: Overlay = None,
     sets: Sets = None,
@@ -151,22 +156,23 @@ def replay_recording(
     """Replay RECORDING, deterministic and as fast as possible.
 
     Several recordings are replayed into folders of --out [default: out], on --jobs processes or the workers of
-    --scheduler; complete runs with the same settings are kept.
+    --scheduler; complete runs with the same settings are kept. Exit code 1 when a stage failed, or when no record was
+    decoded.
 
     The first part of a split recording stands for all parts; a later part is replayed alone. --expect takes a whole
     output hash or its first 16 digits: those cover the values, the rest covers the reason texts. With --as-live each
     stage gets the inputs of the live run in the same order; exit code 1 when the hash differs from that of the run.
     The configuration in a recording is data: it may use the stages and links of grd only, and writes to --out only.
 
-    Example: grd replay recordings/street_sweep.mcap --out out/mine
+    Example: grd replay recordings/experiment_3.mcap --out out/mine
     """
     if not hashed and (as_live or expect is not None):
         raise LinkError("--no-hash: --as-live and --expect compare the output hash, leave one of them out")
     if len(recordings) > 1 or scheduler is not None:
         if as_live or expect is not None or view:
             raise LinkError("--as-live, --expect and --view are for one recording: leave them out")
-        request = RunRequest(config or DEFAULT_REPLAY_CONFIG, tuple(overlay or ()), tuple(sets or ()))
-        _replay_all(recordings, request, out_dir or Path("out"), scheduler or jobs, single_process, hashed)
+        requests = [_request(recording, config, overlay, sets) for recording in recordings]
+        _replay_all(recordings, requests, out_dir or Path("out"), scheduler or jobs, single_process, hashed)
         return
     recording = recordings[0]
     if as_live:
@@ -176,19 +182,32 @@ def replay_recording(
             )
         output_hash = _rerun(recording, out_dir, view, trust)
     else:
-        chosen = config or DEFAULT_REPLAY_CONFIG
-        result = _run(recording, chosen, out_dir, overlay or [], sets or [], view, single_process, hashed)
+        request = _request(recording, config, overlay, sets)
+        result = _run(recording, request, out_dir, view, single_process, hashed)
         output_hash = result.output_hash
     if expect is not None and output_hash is not None and not hash_matches(expect, output_hash):
         err.print(f"the output hash is {output_hash}, expected {expect}", markup=False, style="red")
         raise typer.Exit(EXIT_FAILED)
 
 
+def _request(recording: Path, config: Path | None, overlays: list[Path] | None, sets: list[str] | None) -> RunRequest:
+    """The request for a recording; `config` None: the configuration that fits it."""
+    changes = tuple(overlays or ()), tuple(sets or ())
+    return fitting_request(recording, *changes) if config is None else RunRequest(config, *changes)
+
+
 def _replay_all(
-    recordings: list[Path], request: RunRequest, out_dir: Path, workers: Workers, single_process: bool, hashed: bool
+    recordings: list[Path],
+    requests: list[RunRequest],
+    out_dir: Path,
+    workers: Workers,
+    single_process: bool,
+    hashed: bool,
 ) -> None:
     with progress_bar(f"replay {len(recordings)} recordings") as step:
-        outcomes = replay_all(recordings, request, out_dir, workers, step, single_process=single_process, hashed=hashed)
+        outcomes = replay_all(
+            recordings, requests, out_dir, workers, step, single_process=single_process, hashed=hashed
+        )
     for outcome in outcomes:
         (err if outcome.failure else out).print(str(outcome), markup=False, style="red" if outcome.failure else "")
     if any(outcome.failure for outcome in outcomes):
@@ -238,17 +257,14 @@ def _run_live(
 
 def _run(
     recording: Path,
-    config: Path,
+    request: RunRequest,
     out_dir: Path | None,
-    overlays: list[Path],
-    sets: list[str],
     view: bool,
     single_process: bool = False,
     hashed: bool = True,
 ) -> RunResult:
-    folder = _new_folder(out_dir, f"{recording.stem}-{config.stem}")
+    folder = _new_folder(out_dir, f"{recording.stem}-{request.config.stem}")
     with progress_bar(f"replay {recording.name}") as step:
-        request = RunRequest(config, tuple(overlays), tuple(sets))
         result = replay_into(folder, recording, request, step, single_process=single_process, hashed=hashed)
     print_result(result)
     if view:
@@ -260,7 +276,7 @@ def _run_against(config: Path, recording: Path, out_dir: Path | None) -> RunResu
     """Run another configuration on the recording that it names, or else on this one."""
     own = recording_named(config, (), ())
     folder = None if out_dir is None else out_dir.with_name(f"{out_dir.name}-{config.stem}")
-    return _run(own or recording, config, folder, [], [], False)
+    return _run(own or recording, RunRequest(config), folder, False)
 
 
 def _rerun(recording: Path, out_dir: Path | None, view: bool, trusted: bool) -> str | None:

@@ -13,7 +13,7 @@ import typer
 from flow.link import LinkError
 from links.cli.console import out, progress_bar, report_errors
 from links.cli.files import Overwrite
-from links.runs.shipped import shipped, shipped_option
+from links.runs.shipped import shipped_option, shipped_scenario
 
 ClosedLoop = Annotated[
     Path | None,
@@ -28,10 +28,12 @@ ClosedLoop = Annotated[
 
 @report_errors
 def simulate_recording(
-    scenario: Annotated[Path, typer.Argument(callback=shipped, help="Scenario file, as in configs/scenarios/.")],
+    scenario: Annotated[
+        Path, typer.Argument(callback=shipped_scenario, help="Scenario file, as in configs/scenarios/.")
+    ],
     out_file: Annotated[Path, typer.Option("--out", "-o", help="Recording to write.")],
     seed: Annotated[
-        int | None, typer.Option("--seed", help="Seed of scene and noise [default: the scenario's].")
+        int | None, typer.Option("--seed", min=0, help="Seed of scene and noise [default: the scenario's].")
     ] = None,
     closed_loop: ClosedLoop = None,
     duration_s: Annotated[

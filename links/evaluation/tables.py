@@ -128,6 +128,8 @@ def write_parquet(path: Path, evaluations: list[Evaluation]) -> None:
 
 def read_parquet(path: Path) -> pd.DataFrame:
     """A table of runs that `write_parquet` wrote, without the evaluations themselves. LinkError: it is none."""
+    if not path.is_file():
+        raise LinkError(f"{path}: no such file: check the name")
     try:
         runs = pd.read_parquet(path)
     except (OSError, ValueError) as error:

@@ -31,11 +31,13 @@ def export(
     out: Path,
     *,
     recording: Path | None = None,
+    rig_yaml: str | None = None,
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> ExportReport:
     """Write a recording, or a run's folder with its own recording or `recording`, to the new file `out`.
 
+    `rig_yaml` is used where the recording has no rig.
     LinkError when there is nothing to export, or `out` exists and is no MCAP file that may be overwritten.
     """
     if out.exists() and not (overwrite and _is_mcap(out)):
@@ -51,7 +53,7 @@ def export(
         raise LinkError(f"{out} cannot be written: {error.strerror}") from None
     try:
         with os.fdopen(number, "wb") as stream:
-            report = _write(stream, source, out, recording, progress)
+            report = _write(stream, source, out, recording, rig_yaml, progress)
         Path(name).chmod(0o644)
         Path(name).replace(out)
     finally:
@@ -60,7 +62,12 @@ def export(
 
 
 def _write(
-    stream: BinaryIO, source: Path, out: Path, recording: Path | None, progress: Progress | None
+    stream: BinaryIO,
+    source: Path,
+    out: Path,
+    recording: Path | None,
+    rig_yaml: str | None,
+    progress: Progress | None,
 ) -> ExportReport:
     warnings: list[str] = []
     topics: Counter[str] = Counter()
@@ -69,7 +76,7 @@ def _write(
     channels: dict[str, int] = {}
     writer, messages = Writer(stream, compression=CompressionType.ZSTD), FoxgloveMessages()
     writer.start(profile="", library=LIBRARY)
-    for entry in exported_messages(source, recording, warnings, progress):
+    for entry in exported_messages(source, recording, rig_yaml, warnings, progress):
         for m in messages.of(entry):
             if not finite(m.values):
                 not_finite[m.topic] += 1

@@ -12,7 +12,8 @@ import typer
 from rich.table import Table
 
 from flow.link import LinkError
-from links.cli.console import check_new, out, progress_bar, report_errors, show_table, warn
+from links.cli.console import check_output, out, progress_bar, report_errors, show_table, warn
+from links.cli.files import read_rig
 
 MAX_FACT_CHARACTERS = 200
 
@@ -35,7 +36,7 @@ def info(
     if mapping is not None:
         if found.mapping is None:
             raise LinkError(f"{file} is no ROS bag: only a bag has a mapping")
-        check_new(mapping, "--map", overwrite=overwrite)
+        check_output(mapping, "--map", overwrite=overwrite)
     for name, text in found.facts:
         short = text if len(text) <= MAX_FACT_CHARACTERS else f"{text[:MAX_FACT_CHARACTERS]} ..."
         out.print(f"{name}: {short}", markup=False)
@@ -64,6 +65,7 @@ def export(
     recording: Annotated[
         Path | None, typer.Option("--recording", help="Recording of the run, to add the sensors' data.")
     ] = None,
+    rig: Annotated[Path | None, typer.Option("--rig", help="rig.yaml of a recording that has none.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing bag or file.")] = False,
     foxglove: Annotated[
         bool, typer.Option("--foxglove", help="Write one MCAP file in Foxglove's schemas [NAME_foxglove.mcap].")
@@ -71,7 +73,7 @@ def export(
 ) -> None:
     """Write a recording or a run as a ROS 2 bag (MCAP) for RViz and ros2 bag play, or as a file for Foxglove.
 
-    Example: grd export out/street_sweep-replay --recording recordings/street_sweep.mcap --foxglove
+    Example: grd export out/street_sweep-estimate --recording recordings/street_sweep.mcap --foxglove
     """
     from links.foxglove import export as write_foxglove
     from links.ros.export import export as write_ros
@@ -81,7 +83,8 @@ def export(
     write, ending = (write_foxglove, "_foxglove.mcap") if foxglove else (write_ros, "_ros2")
     target = out_folder or source.absolute().parent / f"{source.absolute().stem}{ending}"
     with progress_bar(f"export {source.name}") as step:
-        report = write(source, target, recording=recording, overwrite=overwrite, progress=step)
+        rig_yaml = None if rig is None else read_rig(rig)
+        report = write(source, target, recording=recording, rig_yaml=rig_yaml, overwrite=overwrite, progress=step)
     for text in report.warnings:
         warn(text)
     topics = ", ".join(f"{count} on {topic}" for topic, count in report.topics.items())

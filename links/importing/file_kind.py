@@ -67,7 +67,7 @@ def file_kind(path: Path) -> FileKind | None:
             folder = f"give its folder with {BAG_METADATA}, or " if path.suffix == ".zstd" else ""
             raise LinkError(f"{path} is compressed as a whole: {folder}unpack it first (`{unpack} {path}`)")
     if start.startswith(MCAP0_MAGIC):
-        return FileKind.RECORDING if _mcap_profile(start) == PROFILE.encode() else FileKind.BAG
+        return FileKind.RECORDING if _mcap_profile(start) in (None, PROFILE.encode()) else FileKind.BAG
     for magic, kind in ((_ROS1, FileKind.BAG), (_SQLITE, FileKind.BAG), (_ULOG, FileKind.ULOG)):
         if start.startswith(magic):
             return kind
@@ -84,8 +84,13 @@ def file_bytes(path: Path) -> int:
     return sum(file.stat().st_size for file in files)
 
 
-def _mcap_profile(start: bytes) -> bytes:
-    """The profile in the header, the first record of an MCAP file: opcode, length u64, profile (u32 length, text)."""
+def _mcap_profile(start: bytes) -> bytes | None:
+    """The profile in the header, the first record of an MCAP file: opcode, length u64, profile (u32 length, text).
+
+    None: the file is cut off before it.
+    """
     at = len(MCAP0_MAGIC) + 9
+    if len(start) < at + 4:
+        return None
     size = int.from_bytes(start[at : at + 4], "little")
     return start[at + 4 : at + 4 + size]

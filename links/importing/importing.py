@@ -22,7 +22,7 @@ from links.importing.ulog_file import UlogFile
 from links.lidar import rig_unit
 from links.recording.format import Progress
 from links.recording.reader import open_file
-from links.recording.writer import RecordingWriter
+from links.recording.writer import RecordingWriter, beside
 from links.ros.mapping import BagMapping
 
 _PROGRESS_EVERY = 1000  # records
@@ -57,7 +57,7 @@ def import_file(
     partial output is removed.
     """
     source = Path(path)
-    target = Path(out) if out is not None else source.with_suffix(".mcap")
+    target = Path(out) if out is not None else beside(source, ".mcap")
     if target.exists() and source.exists() and target.samefile(source):
         if file_kind(source) is FileKind.RECORDING:
             raise LinkError(_already_one(source))

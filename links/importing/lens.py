@@ -13,8 +13,9 @@ import yaml
 
 from flow.config.yaml_text import YamlTextError, yaml_values
 from flow.link import LinkError
-from links.cli.console import check_new, out, report_errors
+from links.cli.console import check_output, out, report_errors
 from links.cli.files import Overwrite
+from links.recording.writer import beside
 from stages.geometry.lens_files import CalibratedLens, LensFileError, lens_from_kalibr, lens_from_ocamcalib
 from stages.messages import CameraMount
 
@@ -26,7 +27,10 @@ def import_lens(
     file: Annotated[Path, typer.Argument(help="Kalibr's camchain.yaml, or OCamCalib's calib_results.txt.")],
     camera_mount: Annotated[CameraMount, typer.Argument(help="Which camera of the rig it is.")],
     out_file: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Rig file to write [default: FILE with .CARRIER.rig.yaml].")
+        Path | None,
+        typer.Option(
+            "--out", "-o", help="Rig file to write [default: FILE with .vehicle.rig.yaml or .drone.rig.yaml]."
+        ),
     ] = None,
     camera: Annotated[str, typer.Option("--camera", help="Its name in Kalibr's file.")] = "cam0",
     max_off_axis_deg: Annotated[
@@ -47,10 +51,10 @@ def import_lens(
 
     Example: grd lens camchain.yaml vehicle --camera cam0 -o configs/rigs/vehicle_lens.yaml
     """
-    target = out_file or file.with_suffix(f".{camera_mount.value}.rig.yaml")
+    target = out_file or beside(file, f".{camera_mount.value}.rig.yaml")
     if target.suffix not in (".yaml", ".yml"):
         raise LinkError(f"{target}: a rig file ends in .yaml")
-    check_new(target, "--out", overwrite=overwrite and target.resolve() != file.resolve())
+    check_output(target, "--out", overwrite=overwrite and target.resolve() != file.resolve())
     found = read_lens(file, camera, max_off_axis_deg)
     target.write_text(lens_text(found, camera_mount, file.name), encoding="utf-8")
     lens, size_px = found

@@ -8,6 +8,7 @@ Source: draft-ietf-opsawg-pcap (file format); https://www.tcpdump.org/linktypes.
 from __future__ import annotations
 
 import ipaddress
+import shlex
 import struct
 from collections import Counter
 from collections.abc import Iterator
@@ -63,7 +64,8 @@ def read_datagrams(stream: IO[bytes], path: Path, report: PcapReport) -> Iterato
     """UDP datagrams in file order. LinkError for what is no classic pcap; damage later on ends it with a warning."""
     header = stream.read(_FILE_HEADER_BYTES)
     if header[:4] == _PCAPNG:
-        raise LinkError(f"{path} is a pcapng capture: convert it with `editcap -F pcap {path} {path.stem}.pcap`")
+        command = shlex.join(["editcap", "-F", "pcap", str(path), str(path.with_name(f"{path.stem}-classic.pcap"))])
+        raise LinkError(f"{path} is a pcapng capture: convert it with `{command}`")
     if header[:4] not in _MAGIC:
         raise LinkError(f"{path} is no pcap capture: it starts with {header[:4].hex(' ')}")
     if len(header) < _FILE_HEADER_BYTES:

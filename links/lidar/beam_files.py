@@ -44,21 +44,35 @@ def ouster_beams(text: str, source: str) -> tuple[LidarModel, LidarBeams]:
     except KeyError as error:
         raise LinkError(f"{source}: not the metadata of an Ouster sensor: it has no {error}") from None
     except (TypeError, AttributeError, ValueError) as error:
-        raise LinkError(f"{source}: not the metadata of an Ouster sensor: {str(error).splitlines()[0]}") from None
+        raise LinkError(f"{source}: not the metadata of an Ouster sensor: {_reason(error)}") from None
     return model, beams
 
 
-def hesai_beams(text: str, source: str) -> LidarBeams:
-    """Beams from a Hesai XT's angle correction file (CSV: channel, elevation, azimuth). LinkError if it is none."""
+def hesai_beams(text: str, source: str) -> tuple[LidarModel, LidarBeams]:
+    """Model and beams from a Hesai XT's angle correction file (CSV: channel, elevation, azimuth).
+
+    LinkError: it is none.
+    """
     try:
         rows = sorted(
             (int(row[0]), float(row[1]), float(row[2])) for row in list(csv.reader(StringIO(text)))[1:] if row
         )
         if [channel for channel, _, _ in rows] != list(range(1, len(rows) + 1)):
             raise ValueError("its channels are not 1, 2, 3, ...")
-        return LidarBeams(elevation_deg=tuple(w for _, w, _ in rows), azimuth_deg=tuple(a for _, _, a in rows))
+        model: Any = f"XT{len(rows)}"
+        if model not in LIDAR_MODELS:
+            raise ValueError(f"it has {len(rows)} channels; supported are XT16 and XT32")
+        return model, LidarBeams(elevation_deg=tuple(w for _, w, _ in rows), azimuth_deg=tuple(a for _, _, a in rows))
     except (ValueError, IndexError) as error:
-        raise LinkError(f"{source}: not the angle correction file of a Hesai XT: {error}") from None
+        raise LinkError(f"{source}: not the angle correction file of a Hesai XT: {_reason(error)}") from None
+
+
+def _reason(error: Exception) -> str:
+    """The first error in one line."""
+    if isinstance(error, ValidationError):
+        first = error.errors(include_url=False)[0]
+        return ".".join(map(str, first["loc"])) + f": {first['msg'].removeprefix('Value error, ')}"
+    return str(error).splitlines()[0]
 
 
 def rig_unit(rig_yaml: str, source: str) -> RigLidar:
@@ -68,6 +82,4 @@ def rig_unit(rig_yaml: str, source: str) -> RigLidar:
     except (YamlTextError, KeyError, TypeError) as error:
         raise LinkError(f"{source}: the rig cannot be read: {str(error).splitlines()[0]}") from None
     except ValidationError as errors:
-        first = errors.errors(include_url=False)[0]
-        where = ".".join(str(part) for part in ("lidar", *first["loc"]))
-        raise LinkError(f"{source}: the rig's {where}: {first['msg'].removeprefix('Value error, ')}") from None
+        raise LinkError(f"{source}: the rig's lidar.{_reason(errors)}") from None

@@ -23,6 +23,7 @@ from links.recording.chunk import ChunkRef, Damage, chunk_messages, read_chunk
 from links.recording.format import (
     CONFIG_ATTACHMENT,
     FORMAT_VERSION,
+    MAX_TIME_NS,
     METADATA_FORMAT,
     METADATA_LOSSES,
     METADATA_USER,
@@ -80,9 +81,10 @@ class RecordingReader:
         for text in index.warnings:
             self._warn(text)
         if index.cut_off:
+            count = sum(self.topics.values())
             self._warn(
-                f"ends at byte {index.readable_bytes} of {self._size}: {sum(self.topics.values())} messages readable;"
-                f" `grd recover {self.path}` writes a clean copy ({index.ending or 'it was never closed'})"
+                f"ends at byte {index.readable_bytes} of {self._size}: {count} messages readable"
+                f"{recover_hint(self.path) if count else ''} ({index.ending or 'it was never closed'})"
             )
         dropped = index.metadata.get(METADATA_LOSSES, {}).get("dropped")
         if dropped:
@@ -208,11 +210,18 @@ class RecordingReader:
                 self._warn(
                     f"chunk at byte {chunk.offset}: channel {channel} was never declared; its messages are missing"
                 )
+            elif publish_time > MAX_TIME_NS:
+                self._warn(f"chunk at byte {chunk.offset}: a message on {topic} has no valid stamp; it is left out")
             elif topics is None or topic in topics:
                 record = Record(topic, log_time, publish_time, data[start:end], sequence)
                 entries.append((log_time, sequence, record))
         entries.sort(key=lambda entry: entry[:2], reverse=True)
         return entries
+
+
+def recover_hint(path: Path) -> str:
+    """What a warning adds for a recording of which a part can be read."""
+    return f"; `grd recover {path}` writes a clean copy"
 
 
 def open_file(path: Path) -> IO[bytes]:

@@ -37,12 +37,18 @@ _POLL_S = 0.05
 _RECORD_BYTES = 64  # queue size of a record in addition to its data
 
 
+def beside(source: Path, ending: str) -> Path:
+    """The file next to `source` with another ending: `flight.rig.yaml` for `flight.mcap`; also of the folder `.`."""
+    named = source if source.name else source.absolute()
+    return named.parent / f"{named.stem}{ending}"
+
+
 def create(path: Path, *, overwrite: bool) -> IO[bytes]:
     """Open a new file for a recording. Raises LinkError with the reason."""
     try:
         return path.open("wb" if overwrite else "xb")
     except FileExistsError:
-        raise LinkError(f"{path} exists already: choose another name, or allow it to be overwritten") from None
+        raise LinkError(f"{path} exists already: give another name with -o, or --overwrite") from None
     except FileNotFoundError:
         raise LinkError(f"{path}: there is no folder {path.parent}: create it first") from None
     except IsADirectoryError:

@@ -41,18 +41,20 @@ def export(
     out: Path,
     *,
     recording: Path | None = None,
+    rig_yaml: str | None = None,
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> ExportReport:
     """Write a recording, or a run's folder with its own recording or `recording`, to the new folder `out`.
 
+    `rig_yaml` is used where the recording has no rig.
     LinkError when there is nothing to export, or `out` exists and is no bag that may be overwritten.
     """
     if out.exists() and not (overwrite and (out / BAG_METADATA).is_file()):
         hint = "" if not (out / BAG_METADATA).is_file() else ", or allow it to be overwritten (--overwrite)"
         raise LinkError(f"{out} exists already: choose another name{hint}")
     warnings: list[str] = []
-    messages = exported_messages(source, recording, warnings, progress)
+    messages = exported_messages(source, recording, rig_yaml, warnings, progress)
     first = next(messages, None)
     if first is None:
         raise LinkError(f"{source}: no record that `grd export` converts: `grd info {source}` shows its topics")
@@ -71,7 +73,7 @@ def export(
 
 
 def exported_messages(
-    source: Path, recording: Path | None, warnings: list[str], progress: Progress | None
+    source: Path, recording: Path | None, rig_yaml: str | None, warnings: list[str], progress: Progress | None
 ) -> Iterator[Entry]:
     """The messages of a run and those of its recording, or of a recording, by time."""
     of_run: list[Entry] = []
@@ -85,16 +87,18 @@ def exported_messages(
         warnings.append(f"{source}: without the sensors' data: name the recording with --recording to add them")
         yield from of_run
         return
-    yield from heapq.merge(of_run, _recorded_messages(recording, warnings, progress), key=_time_ns)
+    yield from heapq.merge(of_run, _recorded_messages(recording, rig_yaml, warnings, progress), key=_time_ns)
 
 
 def _time_ns(entry: Entry) -> int:
     return entry[2]
 
 
-def _recorded_messages(recording: Path, warnings: list[str], progress: Progress | None) -> Iterator[Entry]:
+def _recorded_messages(
+    recording: Path, rig_yaml: str | None, warnings: list[str], progress: Progress | None
+) -> Iterator[Entry]:
     session = Session(recording)
-    messages = RecordingMessages(session.rig_yaml, str(recording))
+    messages = RecordingMessages(session.rig_yaml or rig_yaml, str(recording))
     for record in session.records(progress=progress):
         yield from messages.of(record)
     yield from messages.end()

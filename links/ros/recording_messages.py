@@ -80,10 +80,12 @@ class RecordingMessages:
             yield from self._static(record.arrival_ns)
         topic = record.topic
         if topic == "/lidar/packets":
+            if self._lidar is None:
+                raise LinkError(f"{self._source} has no rig, so its packets give no points: give the rig with --rig")
             if self._packets and abs(record.stamp_ns - self._packets[0].stamp_ns) >= CLOUD_NS:  # a clock may step
                 yield from self.end()
             self._packets.append(record)
-            if self._lidar is not None and (firings := self._lidar.decode(record)) is not None:
+            if (firings := self._lidar.decode(record)) is not None:
                 self._firings.append(firings)
         elif topic == "/servo/state":
             yield from self._servo(record)
@@ -118,9 +120,7 @@ class RecordingMessages:
 
     def warnings(self) -> list[str]:
         """Topics that were left out."""
-        return [
-            f"{count} records on {topic} are left out: ROS has no message" for topic, count in self._left_out.items()
-        ]
+        return [f"{n} records on {topic} are left out: no message holds them" for topic, n in self._left_out.items()]
 
     def _static(self, time_ns: int) -> Iterator[Entry]:
         """The transforms of the rig that do not change."""

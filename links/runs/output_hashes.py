@@ -109,7 +109,7 @@ def measure(pins: list[Pin], jobs: int) -> Iterator[PinResult]:
 def output_hash(recording: Path, config: Path) -> str:
     """Replay a recording through a configuration without its taps, in one process, every array checked."""
     session = Session(recording)
-    graph = RunRequest(config, sets=_without_taps(config)).graph(session.rig_yaml, f"{recording} (rig.yaml)")
+    graph = RunRequest(config, sets=_without_taps(config)).graph_on(session)
     digest = Digest()
     records = (record for record in session.records() if not record.topic.startswith(TRUTH_TOPICS))
     replay(graph, records, [digest], strict=True)

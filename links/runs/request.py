@@ -8,16 +8,23 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+from flow.config.tree import load_tree
 from flow.config_error import ConfigError, ErrorDetail, Location
 from flow.graph import Graph, load_graph
+from flow.link import LinkError
 from flow.replay import RunReport
 from links.mavlink import Autopilot
+from links.recording import Session
 from links.runs.fused_poses import FULL, FusedPoses
 from links.runs.results import Results
+from links.runs.shipped import CONFIGS
 from links.runs.truth import FixErrors
 from links.runs.usage import Usage
 from stages.geometry.rig import Rig
+
+NO_RIG = "{}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +46,32 @@ class RunRequest:
         if errors := _poses_of_other_drones(graph, str(self.config)):
             raise ConfigError(errors)
         return graph
+
+    def graph_on(self, session: Session) -> Graph:
+        """The graph on the rig of a recording, in place of that of the configuration. LinkError: there is none."""
+        rig_yaml = session.rig_yaml
+        if rig_yaml is None and "rig" in load_tree(self.config).values:
+            rig_yaml = NO_RIG
+            if not self.rig_on(session):
+                text = f"{session.path} has no rig: give that of its vehicle with --overlay"
+                raise LinkError("; ".join([text, *session.warnings]))
+        return self.graph(rig_yaml, f"{session.path} (rig.yaml)")
+
+    def rig_on(self, session: Session) -> dict[str, Any]:
+        """The rig of a recording with the overlays; empty: neither has one."""
+        sections = {"rig": (session.rig_yaml or NO_RIG, f"{session.path} (rig.yaml)")}
+        rig = load_tree(self.config, self.overlays, self.sets, sections).values.get("rig")
+        return rig if isinstance(rig, dict) else {}
+
+
+def fitting_request(recording: Path, overlays: tuple[Path, ...] = (), sets: tuple[str, ...] = ()) -> RunRequest:
+    """grd's own pipeline for a recording: the one with cameras where the rig has them."""
+    request = RunRequest(CONFIGS / "estimate.yaml", overlays, sets)
+    try:
+        has_cameras = bool(request.rig_on(Session(recording)).get("cameras"))
+    except LinkError:  # a replay reports it
+        return request
+    return RunRequest(CONFIGS / "vision.yaml", overlays, sets) if has_cameras else request
 
 
 @dataclass(frozen=True, slots=True)

@@ -125,7 +125,7 @@ class RunFolder:
 
         `truth` None: read the file that a simulated rig wrote next to the recording; the rig is a tap and has ended.
         """
-        warnings = [*warnings, *_remarks(self._graph, report)]
+        warnings = [*warnings, *(truth.warnings() if truth else []), *_remarks(self._graph, report)]
         for text in (*warnings, *([] if output_hash is None else [f"output hash {output_hash}"])):
             self.note(text)
         if truth is not None:
@@ -134,6 +134,7 @@ class RunFolder:
         self._open.close()
         if truth is None:
             truth = read_truth_file(self._recording)
+            warnings += truth.warnings()
         result = RunResult(
             recording=self._recording,
             out_dir=self._folder,
@@ -158,7 +159,7 @@ class RunFolder:
         truth.write(folder)
         errors, poses = truth.fix_errors_of(results.fixes), read_fused_poses(folder, truth)
         result = replace(result, errors=errors, poses=poses)
-        text = json.dumps(summary(result, self._request), indent=2)
+        text = json.dumps(summary(result, self._request), indent=2, allow_nan=False)
         self._write(str((folder / SUMMARY_FILE).relative_to(self._folder)), text + "\n")
         return result
 
@@ -222,21 +223,39 @@ def replay_into(
     single_process: bool = False,
     hashed: bool = True,
 ) -> RunResult:
-    """Replay a recording, all its parts, with its own rig when it has one. Raises ConfigError, LinkError, RunError.
+    """Replay a recording, all its parts, on its own rig. Raises ConfigError, LinkError, RunError.
+
+    RunError also when no record was decoded.
 
     `single_process`: ignore the subprocesses of the configuration. `hashed`: compute the output hash.
     """
     started_s = time.monotonic()
     session = Session(recording)
-    graph = request.graph(session.rig_yaml, f"{recording} (rig.yaml)")
+    graph = request.graph_on(session)
     truth, digest = read_truth_file(recording), Digest() if hashed else None
     clock_warnings = clock_differences(graph, session.config_yaml)
     with RunFolder(folder, recording, request, graph, started_s) as run:
         run_graph = replay if single_process or not can_use_subprocesses() else replay_in_subprocesses
         taps = run.taps if digest is None else (digest, *run.taps)
         report = run_graph(graph, truth.without_truth(session.records(progress=progress)), taps)
+        if nothing := _nothing_decoded(graph, report):
+            raise RunError("; ".join([f"{recording}: {nothing}", *session.warnings, *_remarks(graph, report)]))
         warnings, output_hash = [*session.warnings, *clock_warnings], None if digest is None else digest.hexdigest()
         return run.finish(report, output_hash, truth, warnings, parts=len(session.parts))
+
+
+def _nothing_decoded(graph: Graph, report: RunReport) -> str:
+    """That no source published a message, and what was rejected; empty when one did."""
+    links = [(node, output) for node, output, _ in graph.outputs() if graph.nodes[node].kind == "links"]
+    if any(report.messages.get(f"{node}.{output}") for node, output in links):
+        return ""
+    rejected = [
+        f"{name}: {count} {reason}"
+        for name, counters in report.counters.items()
+        for reason, count in counters.rejected.items()
+        if count
+    ]
+    return "; ".join([f"nothing was replayed: none of its {report.records} records was decoded", *rejected])
 
 
 def clock_differences(graph: Graph, recorded_yaml: str | None) -> list[str]:
@@ -303,7 +322,7 @@ class ReplayOutcome:
 
 def replay_all(
     recordings: Sequence[Path],
-    request: RunRequest,
+    requests: Sequence[RunRequest],
     out_dir: Path,
     workers: Workers,
     progress: Callable[[float, float], None],
@@ -311,7 +330,7 @@ def replay_all(
     single_process: bool = False,
     hashed: bool = True,
 ) -> list[ReplayOutcome]:
-    """Replay into `out_dir/<recording>-<configuration>`. LinkError: two recordings have one name.
+    """Replay each with its request into `out_dir/<recording>-<configuration>`. LinkError: two recordings have one name.
 
     `single_process`, `hashed`: as in `replay_into`.
     """
@@ -320,7 +339,7 @@ def replay_all(
         raise LinkError(f"several recordings are named {twice[0]}: their runs would share a folder; give each --out")
     tasks = [
         ReplayTask(path, out_dir / f"{path.stem}-{request.config.stem}", request, hashed, single_process)
-        for path in recordings
+        for path, request in zip(recordings, requests, strict=True)
     ]
     return run_all(replay_one, tasks, workers, lambda shares: progress(sum(shares), len(tasks)))
 
@@ -328,7 +347,7 @@ def replay_all(
 def replay_one(task: ReplayTask, report: Callable[[float], None]) -> ReplayOutcome:
     """Replay one recording, unless its folder holds the run. A folder with another run is not changed."""
     try:
-        graph = task.request.graph(Session(task.recording).rig_yaml, f"{task.recording} (rig.yaml)")
+        graph = task.request.graph_on(Session(task.recording))
         if holds_run(task.folder, task.recording, graph):
             summary = json.loads((task.folder / SUMMARY_FILE).read_text(encoding="utf-8"))
             return ReplayOutcome(task.recording, task.folder, summary["output_hash"], kept=True)

@@ -6,7 +6,9 @@ Source: ours; recording format in recordings/README.md (/truth/*).
 from __future__ import annotations
 
 import json
+import math
 import re
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,10 +17,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flow.link import LinkError, Record
+from flow.link import Record
 from links.evaluation.association import follow, interpolate
 from links.evaluation.text_files import FULL_POSE, NO_DRONE
 from links.recording import RecordingReader
+from links.recording.format import MAX_TIME_NS
 from links.runs.results import (
     TRUTH_FILE,
     TRUTH_RETURNS_FILE,
@@ -36,6 +39,9 @@ TRUTH_RECORDING = "truth.mcap"  # next to a live recording of the simulated rig;
 DRONE_TOPIC = re.compile(r"/truth/(drone|hits|visible)(?:_([1-9]\d*))?")  # /truth/hits_2: drone 2
 MAX_GAP_NS = 50_000_000  # the truth is not interpolated across a larger gap
 Quaternion = tuple[float, float, float, float]  # x, y, z, w
+INVALID = (ValueError, TypeError, KeyError, OverflowError, RecursionError)  # of a record that is no truth
+MAX_M = 1e7
+NORM_TOLERANCE = 1e-3  # of a quaternion
 CHI2_95_3 = 7.814728  # 95 % quantile of chi-square with 3 degrees of freedom
 
 
@@ -54,18 +60,40 @@ class TruthLog:
 
     vehicle: dict[int, Any] = field(default_factory=dict)
     drones: dict[int, TrueDrone] = field(default_factory=dict)  # by number, from 1
+    invalid: Counter[str] = field(default_factory=Counter)  # records that are left out, by topic
 
     def without_truth(self, records: Iterable[Record]) -> Iterator[Record]:
         """Yield all records except those of truth, which are stored."""
         for record in records:
             match = DRONE_TOPIC.fullmatch(record.topic)
-            if record.topic == TOPIC_VEHICLE:
-                self.vehicle[record.stamp_ns] = _pose(record)
-            elif match:
-                drone = self.drones.setdefault(int(match[2] or 1), TrueDrone())
-                _store(drone, match[1], record)
-            else:
+            if match is None and record.topic != TOPIC_VEHICLE:
                 yield record
+                continue
+            try:
+                self._store(match, record)
+            except INVALID:
+                self.invalid[record.topic] += 1
+
+    def _store(self, match: re.Match[str] | None, record: Record) -> None:
+        """Store a record of the vehicle, or of the drone in its topic. Raises one of INVALID."""
+        if match is None:
+            self.vehicle[record.stamp_ns] = _pose(record.data)
+            return
+        drone = self.drones.setdefault(int(match[2] or 1), TrueDrone())
+        if match[1] == "drone":
+            drone.pose[record.stamp_ns] = _pose(record.data)
+        elif match[1] == "hits":
+            pulses = _pulses(record.data)
+            drone.return_ns = drone.return_ns or []
+            drone.return_ns += pulses
+        else:
+            visible = _visible(record.data)
+            drone.visible = drone.visible or {}
+            drone.visible[record.stamp_ns] = visible
+
+    def warnings(self) -> list[str]:
+        """Topics with invalid records, and how many were left out."""
+        return [f"{count} records on {topic} are invalid: left out" for topic, count in self.invalid.items()]
 
     def add_all(self, records: Iterable[Record]) -> None:
         """Store the truth records among `records`."""
@@ -135,17 +163,6 @@ class TruthLog:
             (folder / drone_file(TRUTH_VISIBLE_FILE, number)).write_text(f"stamp_s,visible\n{rows}", encoding="utf-8")
 
 
-def _store(drone: TrueDrone, what: str, record: Record) -> None:
-    if what == "drone":
-        drone.pose[record.stamp_ns] = _pose(record)
-    elif what == "hits":
-        drone.return_ns = drone.return_ns or []
-        drone.return_ns += _pulses(record)
-    else:
-        drone.visible = drone.visible or {}
-        drone.visible[record.stamp_ns] = _visible(record)
-
-
 def _relative(a: Quaternion, b: Quaternion) -> Quaternion:
     """a^-1 b of unit quaternions (x, y, z, w)."""
     ax, ay, az, aw = a
@@ -158,32 +175,28 @@ def _relative(a: Quaternion, b: Quaternion) -> Quaternion:
     )
 
 
-def _pulses(record: Record) -> list[int]:
-    try:
-        return [int(stamp) for stamp in json.loads(record.data)["pulse_stamp_ns"]]
-    except (ValueError, TypeError, KeyError) as error:
-        raise LinkError(f"{record.topic} at {record.stamp_ns} ns has no pulse stamps ({error!r})") from None
+def _pulses(data: bytes) -> list[int]:
+    stamps = [int(stamp) for stamp in json.loads(data)["pulse_stamp_ns"]]
+    if not all(0 <= stamp <= MAX_TIME_NS for stamp in stamps):
+        raise ValueError("a stamp is out of range")
+    return stamps
 
 
-def _visible(record: Record) -> bool:
-    try:
-        visible = json.loads(record.data)["visible"]
-    except (ValueError, TypeError, KeyError) as error:
-        raise LinkError(f"{record.topic} at {record.stamp_ns} ns has no visibility ({error!r})") from None
+def _visible(data: bytes) -> bool:
+    visible = json.loads(data)["visible"]
     if not isinstance(visible, bool):
-        raise LinkError(f"{record.topic} at {record.stamp_ns} ns: visible is {visible!r}, neither true nor false")
+        raise TypeError(f"visible is {visible!r}")
     return visible
 
 
-def _pose(record: Record) -> tuple[tuple[float, float, float], Quaternion]:
-    try:
-        fields = json.loads(record.data)
-        x, y, z = (float(v) for v in fields["xyz_m"])
-        qx, qy, qz, qw = (float(v) for v in fields["quaternion_xyzw"])
-    except (ValueError, TypeError, KeyError) as error:
-        raise LinkError(
-            f"{record.topic} at {record.stamp_ns} ns has no pose ({error!r}): was it recorded by grd?"
-        ) from None
+def _pose(data: bytes) -> tuple[tuple[float, float, float], Quaternion]:
+    fields = json.loads(data)
+    x, y, z = (float(v) for v in fields["xyz_m"])
+    qx, qy, qz, qw = (float(v) for v in fields["quaternion_xyzw"])
+    if not all(abs(v) < MAX_M for v in (x, y, z)):  # NaN compares false
+        raise ValueError("the position is not finite")
+    if not abs(math.hypot(qx, qy, qz, qw) - 1) < NORM_TOLERANCE:
+        raise ValueError("the quaternion is no rotation")
     return (x, y, z), (qx, qy, qz, qw)
 
 

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from flow.link import LinkError
-from links.cli.console import err, out, report_errors
+from links.cli.console import check_output, err, out, report_errors
+from links.cli.files import Overwrite
 from links.cli.options import Jobs, Scheduler
 
 if TYPE_CHECKING:
@@ -24,6 +25,10 @@ if TYPE_CHECKING:
 
 LISTED_RUNS = 8
 LIBRARIES = ("numpy", "scipy", "pandas")
+
+Without = Annotated[
+    list[str] | None, typer.Option("--without", help="Feature that the model does not use; repeatable.")
+]
 
 
 @report_errors
@@ -36,9 +41,7 @@ def train_detector(
         list[Path] | None,
         typer.Option("--held-out", help="Folder of runs that are scored and not trained on; repeatable."),
     ] = None,
-    left_out: Annotated[
-        list[str] | None, typer.Option("--without", help="Feature that the model does not use; repeatable.")
-    ] = None,
+    left_out: Without = None,
     start_file: Annotated[
         Path | None,
         typer.Option("--start", help="Weights file of an earlier training: the runs change it as far as they differ."),
@@ -48,6 +51,7 @@ def train_detector(
     ] = False,
     jobs: Jobs = 1,
     scheduler: Scheduler = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Train the detector's model and score it on held-out runs.
 
@@ -55,7 +59,7 @@ def train_detector(
     and library versions give the same file, which names the command, the seeds and the scores. Brier score and log loss
     are over classifications of candidates, by range, with and without telemetry.
 
-    Example: grd train-detector out/train/* -o configs/models/detector.yaml --held-out out/held_out
+    Example: grd train-detector out/train/* -o out/detector.yaml --held-out out/held_out
     """
     from links.training.candidates import lidar_model_of, read_candidates
     from links.training.fit import predicted, train
@@ -63,7 +67,8 @@ def train_detector(
 
     if ablation and not held_out:
         raise LinkError("--ablation needs --held-out: the models without a group are scored on these runs")
-
+    check_output(out_file, "--out", overwrite=overwrite)
+    start = None if start_file is None else _read_model(start_file)
     rows, lidar_model = read_candidates(runs, workers=scheduler or jobs), lidar_model_of(runs)
     folders = [run for folder in held_out or [] for run in sorted(folder.iterdir()) if run.is_dir()]
     trained: dict[str, Any] = {
@@ -74,7 +79,6 @@ def train_detector(
         "drones": int(rows.is_drone.sum()),
         "libraries": {name: importlib.metadata.version(name) for name in LIBRARIES},
     }
-    start = None if start_file is None else _read_model(start_file)
     model = train(rows, trained, left_out or [], lidar_model, start)
     _warn_of_end(trained["strength"])
     if folders:
@@ -113,17 +117,17 @@ def _write_model(model: DetectorModel, file: Path) -> None:
 
 def _read_model(file: Path) -> DetectorModel:
     """The model of a weights file. LinkError: it is none, or of other features."""
-    import yaml
     from pydantic import ValidationError
 
+    from flow.config.yaml_text import YamlTextError, yaml_values
     from stages.detect.trained.model import DetectorModel
 
     try:
-        return DetectorModel.model_validate(yaml.safe_load(file.read_text())["stages"]["detect"]["config"]["model"])
+        return DetectorModel.model_validate(yaml_values(file.read_bytes())["stages"]["detect"]["config"]["model"])
     except ValidationError as error:
         raise LinkError(f"{file}: {'; '.join(str(e['msg']) for e in error.errors())}") from None
-    except (OSError, yaml.YAMLError, KeyError, TypeError) as error:
-        raise LinkError(f"{file}: not a weights file of `grd train-detector`: {error!r}") from None
+    except (YamlTextError, KeyError, TypeError) as error:
+        raise LinkError(f"{file}: not a weights file of `grd train-detector`: {error}") from None
 
 
 def _command(

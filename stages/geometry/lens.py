@@ -30,6 +30,7 @@ from stages.kernels.geometry.lens import ANGLE_SERIES, OCAM, polynomial_kernel, 
 
 Pixel = tuple[float, float]
 Polygon = Annotated[tuple[Pixel, ...], Field(min_length=3)]  # corners (column, row)
+FocalPx = Annotated[float, Field(gt=0)]
 
 WIDEST_RHO = 20.0  # focal lengths; no image circle is wider
 
@@ -88,7 +89,7 @@ class Equidistant(_Lens):
     """r = f theta: the ideal fisheye."""
 
     model: Literal["equidistant"] = "equidistant"
-    focal_px: float = Field(gt=0)
+    focal_px: FocalPx
 
     def _radial(self) -> tuple[int, Array64]:
         return ANGLE_SERIES, np.array([1.0, 0.0, 0.0, 0.0, 0.0])
@@ -107,7 +108,7 @@ class KannalaBrandt(_Lens):
     """r = f (theta + k1 theta^3 + k2 theta^5 + k3 theta^7 + k4 theta^9)."""
 
     model: Literal["kannala_brandt"] = "kannala_brandt"
-    focal_px: Pixel  # fx, fy
+    focal_px: tuple[FocalPx, FocalPx]  # fx, fy
     k: tuple[float, float, float, float]
 
     def _radial(self) -> tuple[int, Array64]:

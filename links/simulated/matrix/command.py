@@ -14,7 +14,7 @@ from flow.link import LinkError
 from links.cli.console import EXIT_FAILED, EXIT_USAGE, err, out, progress_bar, report_errors, warn
 from links.cli.options import Jobs, Scheduler
 from links.cli.simulate import ClosedLoop, not_installed
-from links.runs.shipped import shipped, shipped_all
+from links.runs.shipped import shipped, shipped_scenarios
 from stages.geometry.lidar_models import LIDAR_MODELS
 
 if TYPE_CHECKING:  # the simulator is an optional dependency
@@ -229,7 +229,7 @@ def _report(folder: Path, report: MatrixReport) -> None:
 @report_errors
 def fly_scenarios(
     scenarios: Annotated[
-        list[Path], typer.Argument(callback=shipped_all, help="Scenarios with an autopilot in the loop.")
+        list[Path], typer.Argument(callback=shipped_scenarios, help="Scenarios with an autopilot in the loop.")
     ],
     closed_loop: Annotated[
         Path,

@@ -118,10 +118,9 @@ class Simulation:
         self._fixes = None if fixes is None else FixSensor(fixes, self.truth, scenario.lidar_gaps_s, self.seed)
         if scenario.rotation_sensor is not None:
             self.telemetry_sources.append(RotationSensor(scenario.rotation_sensor, self.truth, self.seed))
-        unit = scenario.rig
-        form = packet_format(unit.model, unit.beams)
+        form = packet_format(scenario.rig.model, scenario.rig.beams)
         self._lidar = Lidar(scenario.lidar, scenario.start_ns, self.seed, scenario.weather, form)
-        self.encoder = PacketEncoder(unit, scenario.lidar.return_mode)
+        self.encoder = PacketEncoder(scenario.rig, scenario.lidar.return_mode)
         script = scenario.script if loop is None else ()
         commander = ServoScript(script, self.drone_servo_rad if scenario.drone else None, self.seed)
         shift_ns = round(scenario.mount.servo_time_offset_s * 1e9)

@@ -102,7 +102,7 @@ def test_a_run_prints_the_pose_of_the_drone_its_errors_and_the_result_files(grd,
 
 
 def test_a_run_without_a_fuse_stage_prints_the_positions_of_the_drone(grd, tmp_path):
-    text = grd("replay", STREET, "--overlay", without_viewer(tmp_path))
+    text = grd("replay", STREET, "--config", "replay", "--overlay", without_viewer(tmp_path))
     assert "x forward [m]" in text
     assert "LiDAR positions, errors against the truth" in text
     assert "fused" not in text
@@ -143,7 +143,7 @@ def test_the_quickstart_reaches_the_whole_pose_and_the_paper_does_not(grd, tmp_p
 def test_two_replays_have_one_hash_and_one_never_overwrites_the_other(grd, tmp_path):
     overlay = without_viewer(tmp_path)
     for _ in range(2):
-        grd("replay", STREET, "--overlay", overlay)
+        grd("replay", STREET, "--config", "replay", "--overlay", overlay)
     names = ["street_sweep-replay", "street_sweep-replay-2"]
     hashes = {json.loads((tmp_path / "out" / name / "summary.json").read_text())["output_hash"] for name in names}
     assert len(hashes) == 1
@@ -153,8 +153,8 @@ def test_two_replays_have_one_hash_and_one_never_overwrites_the_other(grd, tmp_p
 
 def test_a_replay_without_the_hash_leaves_the_same_fixes(grd, tmp_path):
     overlay = without_viewer(tmp_path)
-    grd("replay", STREET, "--overlay", overlay, "--out", "a")
-    text = grd("replay", STREET, "--overlay", overlay, "--out", "b", "--no-hash")
+    grd("replay", STREET, "--config", "replay", "--overlay", overlay, "--out", "a")
+    text = grd("replay", STREET, "--config", "replay", "--overlay", overlay, "--out", "b", "--no-hash")
     assert "output hash" not in text
     assert json.loads((tmp_path / "b" / "summary.json").read_text())["output_hash"] is None
     fixes = [(tmp_path / name / "fix_vehicle_drone.tum").read_text() for name in "ab"]
@@ -167,7 +167,8 @@ def test_several_recordings_are_replayed_on_processes_and_complete_runs_are_kept
     for name in ("one", "two"):
         shutil.copy(STREET, tmp_path / f"{name}.mcap")
     (tmp_path / "broken.mcap").write_bytes(b"no recording")
-    several = ("replay", "one.mcap", "broken.mcap", "two.mcap", "--overlay", without_viewer(tmp_path), "--out", "runs")
+    several = ("replay", "one.mcap", "broken.mcap", "two.mcap", "--config", "replay", "--out", "runs")
+    several += ("--overlay", without_viewer(tmp_path))
     text = grd(*several, "--jobs", "2", code=1)
     summaries = [json.loads((tmp_path / "runs" / f"{n}-replay" / "summary.json").read_text()) for n in ("one", "two")]
     pinned = json.loads((ROOT / "recordings" / "hashes.json").read_text())["street_sweep.mcap"]["replay"]
@@ -203,8 +204,8 @@ def test_a_replay_in_several_processes_writes_the_files_of_one(grd, tmp_path, mo
 
 def test_a_changed_setting_changes_the_hash(grd, tmp_path):
     overlay = without_viewer(tmp_path)
-    grd("replay", STREET, "--overlay", overlay, "--out", "a")
-    grd("replay", STREET, "--overlay", overlay, "--out", "b", "--set", "track.frame_s=0.1")
+    grd("replay", STREET, "--config", "replay", "--overlay", overlay, "--out", "a")
+    grd("replay", STREET, "--config", "replay", "--overlay", overlay, "--out", "b", "--set", "track.frame_s=0.1")
     a, b = (json.loads((tmp_path / name / "summary.json").read_text()) for name in "ab")
     assert a["output_hash"] != b["output_hash"]
     assert b["set"] == ["track.frame_s=0.1"]
@@ -244,7 +245,7 @@ def test_a_file_that_is_no_recording_is_reported_in_one_line(grd, tmp_path, cont
 def test_a_truncated_recording_is_replayed_to_its_end_with_a_warning(grd, tmp_path):
     data = STREET.read_bytes()
     (tmp_path / "cut.mcap").write_bytes(data[: len(data) * 2 // 3])
-    text = grd("replay", "cut.mcap", "--overlay", without_viewer(tmp_path))
+    text = grd("replay", "cut.mcap", "--config", "replay", "--overlay", without_viewer(tmp_path))
     assert "warning: " in text
     assert "byte" in text
     summary = json.loads((tmp_path / "out" / "cut-replay" / "summary.json").read_text())
@@ -261,7 +262,7 @@ def test_a_configuration_without_a_recording_runs_live_and_reports_missing_devic
 
 def test_a_recording_from_another_place_is_replayed_with_its_own_rig(grd, tmp_path):
     shutil.copy(ROOT / "recordings" / "einride_vlp16.mcap", tmp_path / "room.mcap")
-    text = grd("replay", "room.mcap", "--overlay", without_viewer(tmp_path))
+    text = grd("replay", "room.mcap", "--config", "replay", "--overlay", without_viewer(tmp_path))
     assert "no drone: " in text
     assert "0 fixes" in text
     config = (tmp_path / "out" / "room-replay" / "config.yaml").read_text()

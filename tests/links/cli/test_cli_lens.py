@@ -56,6 +56,8 @@ def test_a_wrong_file_is_named_with_its_line_and_nothing_is_written(grd, tmp_pat
     before = sorted(tmp_path.iterdir())
     assert grd("lens", "camchain.yaml", "drone", "--camera", "cam1", code=2).startswith("camchain.yaml:8: cam1: ")
     assert grd("lens", "camchain.yaml", "drone", "--camera", "cam7", code=2).startswith("camchain.yaml: no camera")
+    (tmp_path / "camchain.yaml").write_text(KALIBR.replace("intrinsics: [", "intrinsics: [-"))
+    assert "focal_px.0: Input should be greater than 0" in grd("lens", "camchain.yaml", "drone", code=2)
     assert grd("lens", "none.yaml", "drone", code=2).startswith("none.yaml: No such file")
     assert "at most" in grd("lens", "calib_results.txt", "drone", "--max-off-axis-deg", "150", code=2)
     (tmp_path / "calib_results.txt").rename("lens.mat")

@@ -49,7 +49,8 @@ def test_a_configuration_without_drone_search_lists_the_outputs_of_its_stages(dr
 
 
 def test_a_configuration_with_drone_search_does_not_list_them(drive):
-    text = command.grd("replay", "drive.mcap", "--config", ROOT / "configs/replay.yaml", "--set", "viewer.file=null")
+    options = ("--overlay", ROOT / "configs/rigs/standard.yaml", "--set", "viewer.file=null")
+    text = command.grd("replay", "drive.mcap", "--config", ROOT / "configs/estimate.yaml", *options)
     assert "no drone: no sweep was completed" in " ".join(text.split())
     assert "no stage searches for a drone" not in text
 

@@ -68,12 +68,14 @@ def pose(state=PoseState.FULL, **changes):
     return RelativePose(**(values | changes))
 
 
-def shown(report, *messages, terminal=False, news=(), used=""):
+def shown(report, *messages, terminal=False, news=(), used="", **by_output):
     stream = io.StringIO()
     console = Console(file=stream, force_terminal=terminal, width=160, highlight=False, soft_wrap=True)
     with LiveView(console) as view:
         for message in messages:
             view.latest.see("x", message, 0)
+        for output, message in by_output.items():
+            view.latest.see(output, message, 0)
         view.show(RunStatus(12.34, lambda: report, list(news), used))
     return stream.getvalue()
 
@@ -96,6 +98,31 @@ def test_without_a_fused_pose_the_track_and_its_last_fix_are_shown():
     )
     assert "TRACKING: 5 returns; x 3.00  y 4.00  z 5.00 m  sigma 0.30 m; " in shown(report_of(), track, fix)
     assert "no drone yet; 1234 records" in shown(report_of())
+
+
+def test_each_of_two_drones_has_its_state_its_pose_and_its_autopilot():
+    report = report_of()
+    for name, sent in (("autopilot", 70), ("autopilot_2", 30)):
+        report.counters[name] = Counters(groups={"pose rejected": {"no yaw": 12}, "sent": {"ODOMETRY": sent}})
+    two = {"fuse_2.relative_pose": pose(PoseState.LOST, estimate=None), "fuse.relative_pose": pose()}
+    log, screen = shown(report, **two), shown(report, terminal=True, **two)
+    assert "12.3 s; fuse FULL: seen now; x 1.00  y -2.00" in log
+    assert "; fuse_2 LOST: seen now; 1234 records" in log
+    for words in ("fuse FULL: seen now", "fuse_2 LOST: seen now", "no position"):
+        assert words in screen
+    assert "to autopilot: ODOMETRY 70; held back: no yaw 12" in screen
+    assert "to autopilot_2: ODOMETRY 30; held back: no yaw 12" in screen
+
+
+def test_each_of_two_tracks_has_its_own_fix():
+    track = TrackState(stamp_ns=1, state=TrackingState.TRACKING, reason="5 returns", hits=5, frame_s=0.1)
+    fixes = [
+        DroneFix(stamp_ns=1, xyz_vehicle_m=np.array([x, 0.0, 5.0]), covariance_m2=np.eye(3), hits=5) for x in (1.0, 2.0)
+    ]
+    outputs = {"track.track_state": track, "track.drone_fix": fixes[0], "track_2.drone_fix": fixes[1]}
+    line = shown(report_of(), **outputs)
+    assert "track TRACKING: 5 returns; x 1.00" in line
+    assert "track_2 no drone yet; x 2.00" in line
 
 
 def test_a_lost_pose_has_no_numbers():

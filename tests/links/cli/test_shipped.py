@@ -10,7 +10,7 @@ import pytest
 from flow.graph import load_graph
 from links import __version__
 from links.preflight.shipped_values import shipped_values
-from links.runs.shipped import CONFIGS, RECORDINGS, shipped
+from links.runs.shipped import CONFIGS, RECORDINGS, SCENARIOS, shipped, shipped_scenario
 from tests import command
 
 QUIET = """\
@@ -53,6 +53,13 @@ def grd(tmp_path, monkeypatch):
 def test_a_name_is_the_user_s_own_file_or_one_that_comes_with_grd(tmp_path, monkeypatch, name, file):
     monkeypatch.chdir(tmp_path)
     assert shipped(Path(name)) == file
+
+
+def test_the_name_of_a_scenario_is_not_that_of_a_recording(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("experiment_1", "experiment_1.yaml", "configs/scenarios/experiment_1.yaml"):
+        assert shipped_scenario(Path(name)) == SCENARIOS / "experiment_1.yaml"
+    assert shipped_scenario(Path("flight/none.yaml")) == Path("flight/none.yaml")
 
 
 def test_the_user_s_own_file_comes_first(tmp_path, monkeypatch):

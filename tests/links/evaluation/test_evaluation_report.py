@@ -118,6 +118,14 @@ def test_many_runs_are_rows_and_a_median(tmp_path):
     assert pool["runs"] == 6
 
 
+def test_the_outputs_of_one_run_are_not_called_runs(tmp_path):
+    folder = fly(tmp_path / "a")
+    add_pose(folder, EIGHT_HZ, truth_at(EIGHT_HZ), np.tile([0.0, 0, 0, 1], (len(EIGHT_HZ), 1)), None)
+    text = grd("evaluate", folder)
+    assert "all 2 outputs: " in text
+    assert "all 2 runs" not in text
+
+
 def test_the_medians_of_fixes_and_of_poses_are_not_mixed(tmp_path):
     """And no name and no number is cut where the table is wider than a pipe's 80 columns."""
     folders = [fly(tmp_path / f"a-street-with-a-long-name-seed{i}", 0.1, f"seed{i}") for i in range(6)]

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from flow.link import LinkError, Record
-from links.cli.console import check_new
+from links.cli.console import check_output
 from links.importing.info import file_info
 from links.recording import RecordingWriter
 
@@ -46,8 +46,8 @@ def test_rig_and_configuration_are_two_facts(tmp_path: Path):
 
 def test_an_existing_output_file_is_refused_unless_it_may_be_overwritten(tmp_path: Path):
     file = tmp_path / "mapping.yaml"
-    check_new(file, "--map", overwrite=False)
+    check_output(file, "--map", overwrite=False)
     file.touch()
-    check_new(file, "--map", overwrite=True)
+    check_output(file, "--map", overwrite=True)
     with pytest.raises(LinkError, match=r"mapping.yaml exists already: give another name with --map, or --overwrite"):
-        check_new(file, "--map", overwrite=False)
+        check_output(file, "--map", overwrite=False)

@@ -67,7 +67,7 @@ def points_of(lidar: Lidar, records: Iterator[Record]) -> np.ndarray:
 def test_every_point_of_a_hesai_scan_is_that_of_an_independent_decoder(name, points):
     records = hesai_records(name)
     factory = "".join(f"{k + 1},{w},{a}\n" for k, (w, a) in enumerate(zip(*XT32_FACTORY, strict=True)))
-    beams = hesai_beams("Channel,Elevation,Azimuth\n" + factory, "factory.csv") if name == "xt32" else None
+    beams = hesai_beams("Channel,Elevation,Azimuth\n" + factory, "factory.csv")[1] if name == "xt32" else None
     lidar = Lidar(slice_ms=ONE_PACKET_MS, unit=RigLidar(model=name.upper(), beams=beams))
     ours = points_of(lidar, records)
     cloud = next(OTHER.glob(f"hesai_{name}_*.pcd")).read_bytes()
@@ -171,6 +171,20 @@ def test_an_ouster_without_beams_and_beams_of_another_sensor_are_errors():
             ouster_beams(text, "x.json")
     with pytest.raises(LinkError, match="not the angle correction file"):
         hesai_beams("Channel,Elevation,Azimuth\n1,abc,0\n", "x.csv")
+
+
+@pytest.mark.parametrize(
+    ("rows", "reason"),
+    [
+        ("", "it has 0 channels; supported are XT16 and XT32"),
+        ("1,5,0\n2,6,0\n", "it has 2 channels; supported are XT16 and XT32"),
+        ("".join(f"{n},nan,0\n" for n in range(1, 17)), "elevation_deg.0: Input should be a finite number"),
+    ],
+)
+def test_a_correction_file_with_a_wrong_number_of_channels_or_no_angles_is_refused(rows, reason):
+    with pytest.raises(LinkError) as error:
+        hesai_beams("Channel,Elevation,Azimuth\n" + rows, "x.csv")
+    assert str(error.value) == f"x.csv: not the angle correction file of a Hesai XT: {reason}"
 
 
 @pytest.mark.parametrize("mode", ["strongest", "dual"])

@@ -223,3 +223,34 @@ def test_recover_never_overwrites_its_source_or_another_file(tmp_path: Path):
         recover(path, other)
     assert path.read_bytes() == WHOLE
     assert other.read_text() == "precious"
+
+
+def test_recover_writes_no_copy_when_nothing_can_be_read(tmp_path: Path):
+    path = tmp_path / "flight.mcap"
+    path.write_bytes(WHOLE[: chunk_offsets(WHOLE)[0] + 20])
+    with pytest.raises(
+        LinkError, match=r"no record can be read, so that there is nothing to copy; .* ends at byte"
+    ) as error:
+        recover(path)
+    assert "grd recover" not in str(error.value)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_recover_does_not_recommend_itself(tmp_path: Path):
+    path = tmp_path / "flight.mcap"
+    path.write_bytes(WHOLE[:DATA_END])
+    assert any("`grd recover" in text for text in read(path, WHOLE[:DATA_END])[1])
+    report = recover(path)
+    assert report.warnings
+    assert not any("grd recover" in text for text in report.warnings)
+
+
+def test_a_message_with_a_stamp_that_is_no_time_is_left_out(tmp_path: Path):
+    stream = io.BytesIO()
+    file = McapFile(stream, attachments={}, metadata={}, channels={})
+    for number, stamp_ns in enumerate((5, 2**63, 2**64 - 1, 2**63 - 1)):
+        file.add(Record("/servo/state", T0 + number, stamp_ns, b"x", number))
+    file.finish()
+    records, warnings = read(tmp_path / "a.mcap", stream.getvalue())
+    assert [number for _, number, _ in records] == [0, 3]
+    assert any("a message on /servo/state has no valid stamp; it is left out" in text for text in warnings)

@@ -184,7 +184,7 @@ def test_a_lossless_recording_has_the_same_bytes_each_time(tmp_path: Path):
 def test_an_existing_file_is_kept_unless_overwriting_is_allowed(tmp_path: Path):
     path = tmp_path / "a.mcap"
     path.write_text("precious")
-    with pytest.raises(LinkError, match="exists already: choose another name"):
+    with pytest.raises(LinkError, match="exists already: give another name with -o, or --overwrite"):
         RecordingWriter(path)
     assert path.read_text() == "precious"
     write(path, [lidar(0, T0)], overwrite=True)

@@ -76,8 +76,8 @@ def test_a_part_is_opened_when_its_time_is_reached(first):
 
 
 def test_a_replay_reads_and_reports_all_parts_and_has_the_hash_of_one_file(first, tmp_path):
-    text = grd("replay", first, "--out", tmp_path / "split")
-    grd("replay", STREET, "--out", tmp_path / "whole")
+    text = grd("replay", first, "--config", "replay", "--out", tmp_path / "split")
+    grd("replay", STREET, "--config", "replay", "--out", tmp_path / "whole")
     split_run, whole = (json.loads((tmp_path / name / "summary.json").read_text()) for name in ("split", "whole"))
     assert f"{whole['records'] + 1} records in 3 parts, 5.3 s recorded" in text  # and the run's end
     assert split_run["parts"] == 3
@@ -88,7 +88,7 @@ def test_a_replay_reads_and_reports_all_parts_and_has_the_hash_of_one_file(first
 
 
 def test_a_later_part_is_replayed_alone_and_this_is_reported(first, tmp_path):
-    text = grd("replay", part_path(first, 2), "--out", tmp_path / "two")
+    text = grd("replay", part_path(first, 2), "--config", "replay", "--out", tmp_path / "two")
     assert "flight-2.mcap is part 2 of its run, and read alone" in text
     assert "where the first is named, flight.mcap" in text
     assert "1.5 s recorded" in text

@@ -299,3 +299,10 @@ def test_an_existing_folder_is_kept_unless_it_is_a_bag_and_may_be_overwritten(tm
     assert (tmp_path / "small_ros2" / "metadata.yaml").is_file()
     assert CliRunner().invoke(app, ["export", str(path)]).exit_code == 2
     assert CliRunner().invoke(app, ["export", str(path), "--overwrite"]).exit_code == 0
+
+
+def test_a_record_without_a_message_is_counted():
+    messages = RecordingMessages(None, "a.mcap")
+    for _ in range(2):
+        list(messages.of(Record("/cues", 1, 1, b"{}")))
+    assert messages.warnings() == ["2 records on /cues are left out: no message holds them"]

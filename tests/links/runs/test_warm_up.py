@@ -65,7 +65,7 @@ def test_a_later_start_loads_the_functions_that_were_called_in_place_of_the_repl
     assert progress[-1][0] == progress[-1][1]
 
 
-@pytest.mark.parametrize("damage", [b"", b"no pickle", None])
+@pytest.mark.parametrize("damage", [b"", b"no pickle", bytes(100), b"\x80\x04K", b"cmissing\nname\n.", None])
 def test_without_a_file_of_the_calls_the_recording_is_replayed(graph, tmp_path, cache, damage):
     one = recording(tmp_path, b"1")
     assert warm_up(graph, lambda done, total: None, one) is None

@@ -140,9 +140,9 @@ def test_the_file_names_the_options_of_the_command_also_for_many_runs(tmp_path):
 
 def test_a_penalty_at_the_end_of_those_tried_is_a_warning(tmp_path, monkeypatch):
     few = [write_run(tmp_path / f"park-s{seed}-detector", seed, candidates=18, drone_mps=5.0) for seed in (1, 2, 3)]
-    for tried, expected in (((1e5, 1e6), True), ((1e-3, 1.0, 1e6), False)):
+    for name, tried, expected in (("one", (1e5, 1e6), True), ("two", (1e-3, 1.0, 1e6), False)):
         monkeypatch.setattr("links.training.fit.STRENGTHS", tried)
-        arguments = ["train-detector", *map(str, few), "-o", str(tmp_path / "one.yaml")]
+        arguments = ["train-detector", *map(str, few), "-o", str(tmp_path / f"{name}.yaml")]
         result = CliRunner().invoke(app, arguments)
         assert result.exit_code == 0, result.output
         assert ("is at an end of those tried" in result.output) == expected
@@ -230,15 +230,35 @@ def test_the_ablation_scores_a_model_without_each_group(runs, tmp_path):
 
 @pytest.mark.parametrize(
     ("text", "expected"),
-    [("stages: {}", "not a weights file"), (None, "train it again"), ("- [", "not a weights file")],
+    [
+        ("stages: {}", "not a weights file"),
+        (None, "train it again"),
+        ("- [", "not a weights file"),
+        ("\udcff", "is not UTF-8 text"),
+        ("c: " + "[" * 60 + "]" * 60, "too large or too deep"),
+    ],
 )
 def test_a_model_to_start_from_that_does_not_fit_is_refused(runs, tmp_path, text, expected):
     file = tmp_path / "start.yaml"
     if text is None:
         made = train(read_candidates(runs), {}).model_dump(mode="json") | {"feature_version": 1}
         text = yaml.safe_dump({"stages": {"detect": {"config": {"model": made}}}})
-    file.write_text(text)
+    file.write_text(text, errors="surrogateescape")
     arguments = ["train-detector", *map(str, runs), "-o", str(tmp_path / "one.yaml"), "--start", str(file)]
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code != 0
     assert expected in " ".join(result.output.split())
+
+
+def test_an_existing_file_and_a_missing_folder_are_refused_before_the_training(tmp_path):
+    (tmp_path / "one.yaml").write_text("precious")
+    for target, expected in (("one.yaml", "exists already"), ("none/one.yaml", "there is no folder"), ("", "a folder")):
+        arguments = ["train-detector", str(tmp_path / "no_runs"), "-o", str(tmp_path / target)]
+        result = CliRunner().invoke(app, arguments)
+        assert result.exit_code == 2
+        assert expected in " ".join(result.output.split())
+    assert (tmp_path / "one.yaml").read_text() == "precious"
+    overwritten = CliRunner().invoke(
+        app, ["train-detector", str(tmp_path / "no_runs"), "-o", str(tmp_path / "one.yaml"), "--overwrite"]
+    )
+    assert "not the folder of a complete run" in " ".join(overwritten.output.split())

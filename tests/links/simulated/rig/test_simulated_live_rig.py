@@ -59,7 +59,7 @@ def test_a_missing_or_wrong_scenario_is_an_error(tmp_path, capfd):
     (tmp_path / "bad.yaml").write_text(SCENARIO.replace("open_lot", "moon"))
     with pytest.raises(LinkError, match=r"the simulated rig for .*bad.yaml did not start; see its message above"):
         LiveRig(scenario=tmp_path / "bad.yaml", servo=tmp_path / "servo").open(run_of(tmp_path))
-    assert "scene.kind: Input should be" in capfd.readouterr().err
+    assert "scene.kind: must be 'street'" in capfd.readouterr().err
 
 
 def test_the_rig_sends_current_packets_and_its_rays_follow_the_servo(tmp_path, ports):

@@ -87,7 +87,7 @@ TEXTS = {  # source file and its texts
     ],
     "links/mavlink/poses/status_texts.py": ["sending poses", "STOPPED: "],
     "links/mavlink/poses/pose_sender.py": ["no poses sent"],
-    "links/mavlink/poses/fusion_monitor.py": ["autopilot rejects the position ("],
+    "links/mavlink/poses/fusion_monitor.py": ["autopilot rejects the position", "autopilot rejects the yaw"],
     "links/mavlink/poses/sent_state.py": [
         "A restart would not know of sent poses",
         "delete it after a reboot of the autopilot",

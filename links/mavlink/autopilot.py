@@ -32,7 +32,7 @@ from links.mavlink.poses.pose_sender import PoseMessage, PoseSender
 from links.mavlink.poses.sent_state import SentState
 from links.mavlink.profiles import PROFILES, ProfileName, RequiredParameter, YawOutput, required_parameters
 from links.mavlink.readers import AutopilotMessage
-from links.mavlink.source_switch import FIRST_SET, SourceSwitch
+from links.mavlink.source_switch import FIRST_SET, GPS_STATUS_HZ, SourceSwitch
 from links.mavlink.streams.message_intervals import MessageIntervals, MessageRates
 from links.mavlink.transport.connection import Connection, Udp, parse_connection
 from links.mavlink.transport.signing import Signer
@@ -207,7 +207,8 @@ class Autopilot(Source[AutopilotSettings]):
             )
         if self._switch is None:
             self._switch = SourceSwitch(
-                settings.source_set if settings.switch_source else None,
+                settings.source_set,
+                settings.switch_source,
                 settings.required_parameters,
                 target,
                 settings.own_id,
@@ -219,8 +220,14 @@ class Autopilot(Source[AutopilotSettings]):
             target,
             settings.own_id,
             self._poses,
-            OriginSender(settings.global_origin, target),
-            MessageIntervals(settings.message_rates, settings.profile, target, settings.own_id),
+            OriginSender(settings.global_origin, target, settings.own_id),
+            MessageIntervals(
+                settings.message_rates,
+                settings.profile,
+                target,
+                settings.own_id,
+                GPS_STATUS_HZ if settings.switch_source else 0.0,
+            ),
             self._switch,
             self._signer,
             now_ns,

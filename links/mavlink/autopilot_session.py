@@ -54,7 +54,7 @@ ONBOARD_CONTROLLER, NO_AUTOPILOT = 18, 8  # MAV_TYPE, MAV_AUTOPILOT_INVALID
 NO_CONNECTION = -1
 STANDBY, ACTIVE = 3, 4  # MAV_STATE
 REJECTED = (
-    "the autopilot's EKF rejects the position: no poses are sent. Is its compass, its GPS or the servo's mount wrong?"
+    "the autopilot's EKF rejects the pose: no poses are sent. Is its compass, its GPS or the servo's mount wrong?"
 )
 RESTART_REPORTED_NS = 600_000_000_000  # an earlier pose is probably of the same flight, which lasts 10 minutes
 
@@ -261,7 +261,7 @@ class AutopilotSession:
                 self._timesync.on_frame()
                 self._target_ns, self._target_connection = self._now_ns(), self.connection.reconnects
                 self.origin.on_message(message)
-                self.poses.on_estimator_status(message, arrival_ns)
+                self.poses.on_estimator_status(message, arrival_ns, self.switch.uses_grd)
                 self._on_estimate(self.poses.autopilot.add(message, arrival_ns))
                 self.intervals.on_message(message, arrival_ns)
                 self.switch.on_message(message, arrival_ns)

@@ -182,6 +182,12 @@ def _clock(source: ObservedSource, status: AutopilotStatus) -> CheckResult:
         return fail(name, f"its clock was reset {restarts} times: did it reboot, or do two autopilots share one id?")
     if status.clock_offset_ns is None:
         return fail(name, "no message has a time stamp: request ATTITUDE")
+    if status.clock_uncertainty_ns is None and source.counters.get("timesync replies", 0):
+        return warning(
+            name,
+            "its TIMESYNC replies are earlier than its other messages allow, so the error of its clock is not known "
+            "(SITL subtracts the time of a slow line that it does not have: SERIAL0_BAUD 1500)",
+        )
     if status.clock_uncertainty_ns is None:
         foreign = source.counters.rejected.get(FOREIGN_TIMESYNC, 0)
         why = (
@@ -300,6 +306,9 @@ def version_check(name: str, profile: Profile, version: tuple[int, int, int] | N
     if version is None:
         return warning(name, f"its version was not received: check that it is {profile.name} {least} or later")
     text = f"{profile.name} {'.'.join(map(str, version))}"
+    if profile.unknown_version is not None and version[:2] >= profile.unknown_version:
+        before = ".".join(map(str, profile.unknown_version))
+        return fail(name, f"{text}: before {before} is needed: {profile.unknown_version_why}")
     if version[:2] < profile.least_version:
         return fail(name, f"{text}: {least} or later is needed: {profile.least_version_why}")
     return ok(name, text)

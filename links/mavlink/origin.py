@@ -2,9 +2,10 @@
 
 An EKF without GPS needs an origin before it fuses a position. The autopilot is asked for its origin first
 (GPS_GLOBAL_ORIGIN). Ours is sent only after three requests that it acknowledged without reporting an origin; a second
-acknowledgement of one request is for another requester. An autopilot that does not support the request gets no
-origin, because its state is unknown. An EKF that is not ready ignores an origin: it is sent again after each further
-request without an origin, until GPS_GLOBAL_ORIGIN confirms it. All of this starts again after a silence or a reboot.
+acknowledgement of one request, or one that names another requester, is not ours. An autopilot that does not support the
+request gets no origin, because its state is unknown. An EKF that is not ready ignores an origin: it is sent again after
+each further request without an origin, until GPS_GLOBAL_ORIGIN confirms it. All of this starts again after a silence or
+a reboot.
 
 Source: https://mavlink.io/en/messages/common.html#SET_GPS_GLOBAL_ORIGIN; ArduPilot NavEKF3_core::setOrigin (rejects a
 second origin; older versions did not).
@@ -18,7 +19,7 @@ from typing import Any
 from pydantic import Field
 
 from flow.stage import StrictModel
-from links.mavlink.commands import ACCEPTED, DENIED, FAILED, command_long
+from links.mavlink.commands import ACCEPTED, DENIED, FAILED, command_long, is_answer
 from links.mavlink.transport.framing import dialect
 
 REQUEST_MESSAGE, GPS_GLOBAL_ORIGIN = 512, 49  # MAV_CMD, message id
@@ -50,9 +51,9 @@ class OriginState(enum.Enum):
 class OriginSender:
     """Requests the autopilot's origin, and sends ours if it has none."""
 
-    def __init__(self, origin: GlobalOrigin | None, target: tuple[int, int]) -> None:
+    def __init__(self, origin: GlobalOrigin | None, target: tuple[int, int], own: tuple[int, int]) -> None:
         self.state = OriginState.NOT_CONFIGURED if origin is None else OriginState.REQUESTING
-        self._origin, self._target = origin, target
+        self._origin, self._target, self._own = origin, target, own
         self._requested_ns: int | None = None
         self._unconfirmed = 0  # times that it was sent since the (re)start
         self._replies = 0
@@ -114,7 +115,7 @@ class OriginSender:
         kind = message.get_type()
         if kind == "GPS_GLOBAL_ORIGIN":
             self.state = OriginState.CONFIRMED if self.state is OriginState.SENT else OriginState.PRESENT
-        elif kind == "COMMAND_ACK" and message.command == REQUEST_MESSAGE and self._requested_ns is not None:
+        elif is_answer(message, REQUEST_MESSAGE, self._own) and self._requested_ns is not None:
             if message.result in HAS_NONE:
                 self._replies += not self._replied  # further ones reply to another requester
                 self._replied = True

@@ -74,11 +74,11 @@ class RequiredParameter:
     bits: int = 0  # all of these must be set
     bits_off: int = 0  # none of these may be set
     why: str = ""
-    when: tuple[str, float] | None = None  # required only while another parameter has this value
+    when: Mapping[str, float] = field(default_factory=dict[str, float])  # only while other parameters have these values
 
     def applies(self, values: Mapping[str, float]) -> bool:
         """Whether it is required, given the values of all parameters."""
-        return self.when is None or values.get(self.when[0]) == self.when[1]
+        return all(values.get(name) == value for name, value in self.when.items())
 
     def fits(self, value: float) -> bool:
         """Whether a value is allowed, within the precision of 32 bits."""
@@ -126,11 +126,13 @@ class Profile:
     integers_bytewise: bool = False  # PARAM_VALUE holds an integer's bytes, not its value
     least_version: tuple[int, int] = (0, 0)
     least_version_why: str = ""
+    unknown_version: tuple[int, int] | None = None  # from this one on it is not supported
+    unknown_version_why: str = ""
 
 
 _ZERO_OFFSET = "grd sends the pose of the drone's body, not of a camera"
 _DELAY = "transmission delay only: poses are predicted to the time of sending"
-EXTERNAL = 6.0  # ExternalNav, of an EK3_SRC parameter
+GPS, EXTERNAL = 3.0, 6.0  # of EK3_SRCn_POSXY; the latter, ExternalNav, of the others, too
 VISUAL_ODOMETRY_CHECK = 1 << 18  # of ARMING_CHECK
 
 _NO_ROTATION = "its angles cannot be left out, so it cannot be a position without yaw; send odometry"
@@ -138,6 +140,8 @@ ARDUPILOT = Profile(
     name="ardupilot",
     least_version=(4, 6),
     least_version_why="earlier ones reset the position to GPS while the source set of grd is used",
+    unknown_version=(4, 7),
+    unknown_version_why="ARMING_SKIPCHK replaces ARMING_CHECK there, and the rules of grd were not compared with it",
 )
 PX4 = Profile(
     name="px4",
@@ -174,7 +178,7 @@ def _ardupilot_yaw(yaw: YawOutput, own: str) -> tuple[RequiredParameter, ...]:
         RequiredParameter(
             own + "YAW",
             (source,),
-            when=("EK3_SRC1_YAW", source),
+            when={"EK3_SRC1_YAW": source},
             why="as EK3_SRC1_YAW: a change of the source resets the yaw, and grd then knows the axes no more",
         )
         for source in (1.0, 2.0, 3.0)
@@ -193,11 +197,25 @@ def _ardupilot(yaw: YawOutput, source_set: int) -> tuple[RequiredParameter, ...]
     own = f"EK3_SRC{source_set}_"
     without_grd = "set 1 flies without grd"
     other = (
-        RequiredParameter("EK3_SRC1_POSXY", (3.0, 0.0), why=f"{without_grd}: GPS, or none where there is no GPS"),
+        RequiredParameter("EK3_SRC1_POSXY", (GPS, 0.0), why=f"{without_grd}: GPS, or none where there is no GPS"),
         RequiredParameter("EK3_SRC1_VELXY", (3.0, 0.0, 5.0), why=without_grd),
         RequiredParameter("EK3_SRC1_POSZ", (1.0, 2.0, 3.0), why=without_grd),
         RequiredParameter("EK3_SRC1_VELZ", (3.0, 0.0), why=without_grd),
         RequiredParameter("EK3_SRC1_YAW", (1.0, 2.0, 3.0), why=without_grd),
+    )
+    spare = f"EK3_SRC{5 - source_set}_"  # selected by the third position of the switch
+    hit_by_mistake = "the third position of the switch selects it, and a set without sources loses position and yaw"
+    spare_set = (
+        RequiredParameter(
+            spare + "POSXY",
+            (GPS, 4.0, EXTERNAL),
+            when={"EK3_SRC1_POSXY": GPS, spare + "VELXY": 0.0},
+            why=f"as set 1: {hit_by_mistake}",
+        ),
+        RequiredParameter(
+            spare + "VELXY", (3.0, 0.0, 4.0, 5.0, EXTERNAL, 7.0), why="velocity of the set that grd does not use"
+        ),
+        RequiredParameter(spare + "YAW", (1.0, 2.0, 3.0, EXTERNAL, 8.0), why=f"as set 1: {hit_by_mistake}"),
     )
     return (
         RequiredParameter("AHRS_EKF_TYPE", (3.0,), why="only EKF3 fuses an external pose"),
@@ -209,11 +227,11 @@ def _ardupilot(yaw: YawOutput, source_set: int) -> tuple[RequiredParameter, ...]
         RequiredParameter(
             own + "POSZ",
             (EXTERNAL,),
-            when=("EK3_SRC1_POSXY", 0.0),
+            when={"EK3_SRC1_POSXY": 0.0},
             why="without a position in set 1 the switch sets the height to grd's, and the barometer would pull it back",
         ),
         *_ardupilot_yaw(yaw, own),
-        *(other if source_set != 1 else ()),
+        *((*other, *spare_set) if source_set != 1 else ()),
         RequiredParameter(
             "ARMING_CHECK",
             bits_off=1 | VISUAL_ODOMETRY_CHECK,
@@ -270,8 +288,9 @@ def _px4(yaw: YawOutput) -> tuple[RequiredParameter, ...]:
 
 def best_values(required: Sequence[RequiredParameter]) -> dict[str, float]:
     """Values with which all fit."""
-    always = {parameter.name: parameter.best for parameter in required if parameter.when is None}
-    return always | {parameter.name: parameter.best for parameter in required if parameter.applies(always)}
+    conditional_first = sorted(required, key=lambda parameter: not parameter.when)
+    values = {parameter.name: parameter.best for parameter in conditional_first}
+    return values | {parameter.name: parameter.best for parameter in required if parameter.applies(values)}
 
 
 def findings(required: Sequence[RequiredParameter], values: Mapping[str, float]) -> list[str]:

@@ -5,19 +5,23 @@ The switch to grd's set is requested (MAV_CMD_SET_EKF_SOURCE_SET) while all of t
     armed, in a mode that holds or is flown by hand
     its parameters are as `profiles.py` requires; they are read once after each boot
     poses have been sent for MIN_SENDING_NS, and the newest contains a LiDAR position of the last second
-    its EKF reports its state, and no test ratio of position or velocity above MAX_RATIO
+    its EKF reports its state, and no test ratio of position or velocity above MAX_RATIO. That of the compass must be
+        below the threshold of the EKF failsafe: it is kept where grd's yaw replaces the compass (`getVariances`)
     the poses move as its own estimate does (`poses/agreement.py`), and are no more than FAR_M away from it, unless its
         EKF has no position to compare
     it is slow enough for the angle between both axes, see below
 
 A request that is denied, or that is not acknowledged three times, is not repeated until the autopilot boots. Nor is any
 after somebody else has selected another set: ArduPilot names a set that its remote control selects in a STATUSTEXT. It
-acknowledges our command without a text, and reports nowhere which set is in use.
+acknowledges our command without a text, and reports nowhere which set is in use: after a boot, or a start of grd, it is
+unknown until a text or an acknowledgement.
 
 Set 1 is requested FALLBACK_AFTER_NS after the last pose, once a second until it is acknowledged, if its position is
-from another source than grd. ArduPilot alone does not return to it. Without a connection, or after the end of grd,
-nothing is requested: the pilot has to switch. Neither does grd that was restarted in flight request set 1 before it has
-requested its own set again, because it does not know which set is in use.
+from another source than grd, and GPS has a fix that EKF3 would use. ArduPilot alone does not return to it, and checks
+nothing at the command. On grd's set it flies on for 7 s without a position: poses that return within that time are
+better than a set 1 without GPS. Without a connection, or after the end of grd, nothing is requested: the pilot has to
+switch. Neither does grd that was restarted in flight request set 1 before it has requested its own set again, because
+it does not know which set is in use.
 
 Poses with yaw are in axes parallel to those that the autopilot had at the first one. If its EKF has reset its yaw
 since, they are not parallel any more. With the source of the yaw the EKF turns its axes, but not its velocity:
@@ -26,7 +30,8 @@ some 4 m/s) is not reset either but flown with. So no set is requested, set 1 ne
 axes would be wrong by more than MAX_TURNED_MPS.
 
 Source: ours; ArduPilot GCS_MAVLINK::handle_command_set_ekf_source_set, RC_Channel::do_aux_function (EKF_SOURCE_SET),
-ArduCopter mode.h (numbers of modes), NavEKF3_core::send_status_report.
+ArduCopter mode.h (numbers of modes), ekf_check.cpp (FS_EKF_THRESH), NavEKF3_core::send_status_report, getVariances,
+calcGpsGoodToAlign (horizontal accuracy).
 """
 
 from __future__ import annotations
@@ -42,8 +47,8 @@ from links.mavlink.commands import ACCEPTED, ACK_TIMEOUT_NS, IN_PROGRESS, TEMPOR
 from links.mavlink.poses.agreement import MotionAgreement
 from links.mavlink.poses.autopilot_estimate import AutopilotEstimate
 from links.mavlink.poses.sent_frame import FAR_M, SentFrame
-from links.mavlink.profiles import EXTERNAL, RequiredParameter, findings
-from links.mavlink.readers import CONSTANT_POSITION, HORIZONTAL_RELATIVE
+from links.mavlink.profiles import EXTERNAL, GPS, RequiredParameter, findings
+from links.mavlink.readers import CONSTANT_POSITION, FIX_3D, HORIZONTAL_RELATIVE
 from links.mavlink.transport.framing import dialect
 from stages.messages import RelativePose
 
@@ -56,6 +61,9 @@ FALLBACK_AFTER_NS = 500_000_000  # without a pose; ArduPilot's position times ou
 MAX_FIX_AGE_NS = 1_000_000_000  # age of the LiDAR position in a pose
 MAX_STATUS_AGE_NS = 2_000_000_000  # age of the EKF's status
 MAX_RATIO = 0.5  # test ratio; above 1 the EKF rejects
+FAILSAFE_RATIO = 0.8  # FS_EKF_THRESH
+MAX_GPS_SIGMA_M = 5.0  # as EKF3 requires before it uses GPS
+GPS_STATUS_HZ = 2.0  # rate at which GPS_RAW_INT is requested for it
 MAX_TURNED_MPS = 1.0  # ours, chosen: error of the EKF's velocity after a change of axes
 HYSTERESIS_M = 2.0  # below FAR_M, from which a switch is requested again
 TRIES = 3
@@ -64,11 +72,12 @@ USING = re.compile(r"Using EKF Source Set (\d)")
 
 
 class SourceSwitch:
-    """Requests source sets of one ArduPilot, in one run of grd. `source_set` None: none is requested."""
+    """Knows the source set of one ArduPilot, and requests sets if `enabled`; in one run of grd."""
 
     def __init__(
         self,
-        source_set: int | None,
+        source_set: int,
+        enabled: bool,
         required: Sequence[RequiredParameter],
         target: tuple[int, int],
         own: tuple[int, int],
@@ -78,23 +87,27 @@ class SourceSwitch:
         self.requests = 0
         """How often a set was requested."""
         self.agreement = MotionAgreement(pose_sigma_m)
-        self._set, self._required = source_set, required
+        self._set, self._enabled, self._required = source_set, enabled, required
         self._target, self._own, self._warn = target, own, warn
         self.on_boot()
 
     def on_boot(self) -> None:
-        """The autopilot has booted, or may have: it uses set 1, and its parameters may have changed."""
-        self.active: int | None = FIRST_SET
-        """The set in use, as far as is known."""
+        """The autopilot has booted, or may have: its parameters may have changed.
+
+        It uses set 1, unless the switch of the remote control selects another one at once.
+        """
+        self.active: int | None = None
+        """The set in use; None: not known."""
         self._values: dict[str, float] = {}
         self._parameter_requests, self._parameter_ns = 0, 0
         self._armed, self._mode = False, -1
         self._status: tuple[int, Any] | None = None  # arrival and message
+        self._gps: Any | None = None  # newest GPS_RAW_INT
         self._position_ns = 0  # newest LOCAL_POSITION_NED
         self._speed_mps = 0.0  # of it, horizontal
         self._step_m: float | None = None  # of the position at a switch, if it is too large
         self._turn_rad = math.pi  # of the axes of the poses against those of its own sources; at first unknown
-        self._too_fast = False  # set 1 is due, see `_is_slow`
+        self._warned = ""  # why set 1, which is due, is not requested
         self._blocked = ""  # why grd's set is not requested any more
         self._pending: tuple[int, int] | None = None  # the set requested, and when
         self._tries = 0
@@ -106,7 +119,7 @@ class SourceSwitch:
     @property
     def status(self) -> str | None:
         """Why no switch is requested any more, or what is wrong with the parameters; None: nothing to report."""
-        if self._set is None:
+        if not self._enabled:
             return None
         if self._blocked:
             return f"source set {self._set} is not requested: {self._blocked}"
@@ -116,12 +129,19 @@ class SourceSwitch:
             wrong.append(f"the position would move by {self._step_m:.0f} m; land and reboot the autopilot")
         return f"source set {self._set} is not requested: {wrong[0]}" if wrong else None
 
+    @property
+    def uses_grd(self) -> bool | None:
+        """Whether the set in use is that of grd; None: not known."""
+        return None if self.active is None else self.active == self._set
+
     def on_message(self, message: Any, arrival_ns: int) -> None:
         """Take a message of the autopilot."""
-        if self._set is None:
-            return
         kind = message.get_type()
-        if kind == "HEARTBEAT":
+        if kind == "STATUSTEXT":
+            self._on_text(message.text)
+        elif not self._enabled:
+            return
+        elif kind == "HEARTBEAT":
             self._armed, self._mode = bool(message.base_mode & ARMED), message.custom_mode
         elif kind == "EKF_STATUS_REPORT":
             self._status = arrival_ns, message
@@ -129,8 +149,8 @@ class SourceSwitch:
             self._position_ns, self._speed_mps = arrival_ns, math.hypot(message.vx, message.vy)
         elif kind == "PARAM_VALUE" and message.param_id in self._missing():
             self._values[message.param_id] = float(message.param_value)
-        elif kind == "STATUSTEXT":
-            self._on_text(message.text)
+        elif kind == "GPS_RAW_INT":
+            self._gps = message
         elif is_answer(message, SET_EKF_SOURCE_SET, self._own):
             self._on_result(message.result)
 
@@ -146,13 +166,13 @@ class SourceSwitch:
 
         `turn_rad`: angle of the frame's axes against the autopilot's own; None: not known.
         """
-        if self._set is None:
+        if not self._enabled:
             return
         if self._sending_ns is None or now_ns - self._sent_ns > FALLBACK_AFTER_NS:
             self._sending_ns = now_ns
             self.agreement.restart()
-        self._sent, self._sent_ns, self._too_fast = pose, now_ns, False
-        if self.active == FIRST_SET and turn_rad is not None:
+        self._sent, self._sent_ns, self._warned = pose, now_ns, ""
+        if self.active != self._set and turn_rad is not None:
             self._turn_rad = turn_rad
         off_m = self.agreement.add(pose, frame, autopilot)
         if off_m is not None and self.active != self._set:
@@ -170,17 +190,18 @@ class SourceSwitch:
 
     def due(self, now_ns: int) -> Any | None:
         """The message to send now, if one is due."""
-        if self._set is None:
+        if not self._enabled:
             return None
         if self._pending is not None:
             return self._repeated(*self._pending, now_ns)
         ended = self._sent is not None and now_ns - self._sent_ns > FALLBACK_AFTER_NS
-        if self.active == self._set and ended and self._can_fall_back():
-            if self._is_slow():
+        if self.active == self._set and ended and self._has_other_position():
+            reason = self._why_not_first_set()
+            if not reason:
                 return self._request(FIRST_SET, now_ns)
-            if not self._too_fast:
-                self._too_fast = True
-                self._warn("too fast for source set 1: slow down")
+            if reason != self._warned:
+                self._warned = reason
+                self._warn(reason)
         if self._missing():
             return self._parameter_request(now_ns)
         if self.active != self._set and not self._blocked and self._is_ready(now_ns):
@@ -211,6 +232,8 @@ class SourceSwitch:
         ratios = status.pos_horiz_variance, status.velocity_variance
         if any(math.isfinite(ratio) and ratio > MAX_RATIO for ratio in ratios):
             return False
+        if math.isfinite(status.compass_variance) and status.compass_variance >= FAILSAFE_RATIO:
+            return False
         has_position = status.flags & HORIZONTAL_RELATIVE and not status.flags & CONSTANT_POSITION
         return self.agreement.agrees(now_ns) if has_position else now_ns - self._position_ns > MAX_STATUS_AGE_NS
 
@@ -218,12 +241,19 @@ class SourceSwitch:
         """Whether the velocity that the EKF keeps is nearly right in the axes of the other set."""
         return 2.0 * abs(math.sin(0.5 * self._turn_rad)) * self._speed_mps < MAX_TURNED_MPS
 
-    def _can_fall_back(self) -> bool:
+    def _has_other_position(self) -> bool:
         """Whether set 1 has a position of another source than grd."""
         return self._values.get("EK3_SRC1_POSXY", 0.0) not in (0.0, EXTERNAL)
 
+    def _why_not_first_set(self) -> str:
+        """Why set 1 is worse than grd's without poses; empty: it is not, as far as is known."""
+        gps = self._gps if self._values.get("EK3_SRC1_POSXY") == GPS else None
+        if gps is not None and (gps.fix_type < FIX_3D or 1e-3 * gps.h_acc > MAX_GPS_SIGMA_M):  # 0: not reported
+            return "GPS unusable: source set 1 is not requested"
+        return "" if self._is_slow() else "too fast for source set 1: slow down"
+
     def _missing(self) -> list[str]:
-        names = dict.fromkeys(parameter.name for parameter in self._required)
+        names = dict.fromkeys(parameter.name for parameter in self._required if parameter.applies(self._values))
         return [name for name in names if name not in self._values]
 
     def _parameter_request(self, now_ns: int) -> Any | None:
@@ -271,8 +301,8 @@ class SourceSwitch:
         found = USING.search(text)
         if found is None:
             return
-        number, requested = int(found[1]), self.active if self._pending is None else self._pending[0]
-        if number not in (self._set, requested):
+        number, requested = int(found[1]), self._pending[0] if self._pending else self.active or FIRST_SET
+        if self._enabled and number not in (self._set, requested):
             self._pending, self._tries = None, 0
             self._block(f"the pilot selected set {number}")
         self.active = number

@@ -49,7 +49,7 @@ class RejectReason(enum.Enum):
     ODOM_YAW_SIGMA = "yaw of autopilot's axes uncertain"
     ODOM_YAW_RESET = "autopilot reset its yaw"
     COMPASS = "autopilot's compass is wrong"
-    REJECTED_BY_AUTOPILOT = "autopilot rejects the position"
+    REJECTED_BY_AUTOPILOT = "autopilot rejects the pose"
     NO_ATTITUDE = "no attitude from autopilot"
 
 

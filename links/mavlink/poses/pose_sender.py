@@ -13,7 +13,8 @@ Both are in the frame of the autopilot's own position at the first pose (`SentFr
 position has drifted meanwhile, and the frame begins there.
 
 The reset counter is incremented with every jump of the pose or of its frame, every change of the drone, and after every
-pause that the autopilot noticed, so that it resets to the new pose instead of gating it. Its initial value is
+pause that the autopilot noticed, so that it resets to the new position instead of gating it. ArduPilot does not reset
+its yaw then. Its initial value is
 arbitrary: after a restart of grd it should differ from the previous one.
 
 Texts: `status_texts.py`. Rejection of the pose by the autopilot: `fusion_monitor.py`.
@@ -153,9 +154,12 @@ class PoseSender:
         self._other_boot_rad, self.frame, self._axes_pose = self._odom_yaw_rad, None, None
         self.fusion.on_boot()
 
-    def on_estimator_status(self, message: Any, now_ns: int) -> None:
-        """EKF_STATUS_REPORT or ESTIMATOR_STATUS of the autopilot; others are ignored."""
-        rejected = self.fusion.add(message, self._sending, now_ns)
+    def on_estimator_status(self, message: Any, now_ns: int, uses_grd: bool | None = None) -> None:
+        """EKF_STATUS_REPORT or ESTIMATOR_STATUS of the autopilot; others are ignored.
+
+        `uses_grd`: whether ArduPilot uses the source set of grd; None: not known.
+        """
+        rejected = self.fusion.add(message, self._sending, now_ns, uses_grd, self.sends_yaw)
         if rejected is not None:
             text, reset = rejected
             self.texts.warn(text)

@@ -1,6 +1,7 @@
 """STATUSTEXT about the output: which text, when, and short enough.
 
-    output   "STOPPED: " and the reason (critical) as soon as poses stop; "sending poses" (notice) after 1 s of them
+    output   "STOPPED: " and the reason (critical) as soon as poses stop, three times while they do, since a full radio
+             link loses texts; "sending poses" (notice) after 1 s of them
     link     warnings about the link and the autopilot
     state    state of the pose and the first clause of its reason, once it has lasted for 1 s
 
@@ -23,6 +24,7 @@ TextKind = Literal["output", "link", "state"]  # in order of priority
 
 MIN_TEXT_INTERVAL_NS = 2_000_000_000  # minimum interval of texts
 MIN_STATE_DURATION_NS = 1_000_000_000  # a state, or sending, is reported after it has lasted so long
+STOPPED_REPEATS = 2  # of "STOPPED: "
 TEXT_BYTES = 50  # size of STATUSTEXT's text field
 PREFIX = "grd: "
 CRITICAL, WARNING, NOTICE, INFO = 2, 4, 5, 6  # MAV_SEVERITY
@@ -51,6 +53,7 @@ class StatusTexts:
         self._reported: PoseState | None = None
         self._sending_ns: int | None = None  # start of sending; None: not sending
         self._sending_reported = False
+        self._stopped, self._repeats = "", 0  # newest "STOPPED: ", and how often it is still to be repeated
 
     def on_state(self, state: PoseState, reason: str, now_ns: int) -> None:
         """The state of the newest pose."""
@@ -59,14 +62,15 @@ class StatusTexts:
 
     def on_sending(self, now_ns: int) -> None:
         """Poses are sent from now on."""
-        self._sending_ns = now_ns
+        self._sending_ns, self._repeats = now_ns, 0
 
     def on_stopped(self, reason: str) -> None:
         """No poses are sent from now on."""
         self._sending_ns = None
         if self._sending_reported:
             self._sending_reported = False
-            self._waiting["output"] = CRITICAL, f"STOPPED: {reason}"
+            self._stopped, self._repeats = f"STOPPED: {reason}", STOPPED_REPEATS
+            self._waiting["output"] = CRITICAL, self._stopped
 
     def warn(self, text: str) -> None:
         """Queue a warning about the link or the autopilot."""
@@ -75,8 +79,13 @@ class StatusTexts:
     def due(self, now_ns: int) -> list[Any]:
         """The STATUSTEXT to send now, if any."""
         self._queue(now_ns)
-        if not self._waiting or (self._text_ns is not None and 0 <= now_ns - self._text_ns < MIN_TEXT_INTERVAL_NS):
+        if not (self._waiting or self._repeats):
             return []
+        if self._text_ns is not None and 0 <= now_ns - self._text_ns < MIN_TEXT_INTERVAL_NS:
+            return []
+        if not self._waiting:
+            self._waiting["output"] = CRITICAL, self._stopped
+            self._repeats -= 1
         self._text_ns = now_ns
         kind: TextKind = next(kind for kind in get_args(TextKind) if kind in self._waiting)
         severity, text = self._waiting.pop(kind)

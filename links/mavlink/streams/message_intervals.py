@@ -69,7 +69,8 @@ class MessageRates(StrictModel):
     attitude_hz: float = Field(default=25.0, ge=0, le=400)
     position_hz: float = Field(default=25.0, ge=0, le=400)
     estimator_hz: float = Field(default=5.0, ge=0, le=50)
-    gnss_hz: float = Field(default=0.0, ge=0, le=50)  # GPS_RAW_INT and GLOBAL_POSITION_INT, for cues
+    # GPS_RAW_INT and GLOBAL_POSITION_INT, for cues; with `switch_source` GPS_RAW_INT is requested at 2 Hz all the same
+    gnss_hz: float = Field(default=0.0, ge=0, le=50)
 
 
 @dataclass(slots=True)
@@ -109,15 +110,21 @@ class MessageIntervals:
     """Requests the messages of one autopilot and measures the rates at which they arrive."""
 
     def __init__(
-        self, rates: MessageRates, profile: ProfileName, target: tuple[int, int], own: tuple[int, int]
+        self,
+        rates: MessageRates,
+        profile: ProfileName,
+        target: tuple[int, int],
+        own: tuple[int, int],
+        least_gps_hz: float = 0.0,
     ) -> None:
+        """`least_gps_hz`: of GPS_RAW_INT, whatever `rates` say."""
         self._target, self._own = target, own
         self._wanted = (
             (IMU_MESSAGES[profile], rates.imu_hz),
             (("ATTITUDE",), rates.attitude_hz),
             (("LOCAL_POSITION_NED",), rates.position_hz),
             ((ESTIMATOR_MESSAGES[profile],), rates.estimator_hz),
-            (("GPS_RAW_INT",), rates.gnss_hz),
+            (("GPS_RAW_INT",), max(rates.gnss_hz, least_gps_hz)),
             (("GLOBAL_POSITION_INT",), rates.gnss_hz),
         )
         self._counts: Counter[str] = Counter()

@@ -147,6 +147,8 @@ def test_gaps_that_the_rate_hides_are_reported():
 def test_timesync_replies_for_another_component_are_distinguished_from_none():
     none = check(frames(), newest=status(error_ns=None))["it clock"]
     assert "does it receive our frames" in none.sentence
+    early = check(frames(), newest=status(error_ns=None), counters={"timesync replies": 40})["it clock"]
+    assert "its TIMESYNC replies are earlier than its other messages allow" in early.sentence
     foreign = check(frames(), newest=status(error_ns=None), rejected={"TIMESYNC for another component": 7})["it clock"]
     assert "7 were for another component: check own_system_id, own_component_id" in foreign.sentence
 
@@ -186,12 +188,13 @@ def test_parameters_are_compared_with_the_profile(profile):
     [
         (ARDUPILOT, (4, 6, 3), Level.OK, "ardupilot 4.6.3"),
         (ARDUPILOT, (4, 5, 7), Level.FAIL, "ardupilot 4.5.7: 4.6 or later is needed: earlier ones reset"),
+        (ARDUPILOT, (4, 7, 0), Level.FAIL, "ardupilot 4.7.0: before 4.7 is needed: ARMING_SKIPCHK replaces"),
         (ARDUPILOT, None, Level.WARNING, "check that it is ardupilot 4.6"),
         (PX4, (1, 16, 0), Level.OK, "px4 1.16.0"),
         (PX4, (1, 13, 3), Level.FAIL, "1.14 or later is needed"),
     ],
 )
-def test_a_firmware_that_is_too_old_is_found(profile, version, level, text):
+def test_a_firmware_that_is_not_supported_is_found(profile, version, level, text):
     result = version_check("it", profile, version)
     assert (result.level, text in result.sentence) == (level, True)
 

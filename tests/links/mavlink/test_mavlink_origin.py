@@ -34,7 +34,7 @@ def run(sender: OriginSender, seconds: int, *replies: Any) -> list[Any]:
 
 @pytest.mark.parametrize("result", [0, 2, 4])
 def test_the_origin_is_sent_after_three_replies_without_an_origin_and_again_until_it_is_confirmed(result: int):
-    sender = OriginSender(ORIGIN, (1, 1))
+    sender = OriginSender(ORIGIN, (1, 1), (1, 197))
     sent = run(sender, 8, ack(result))
     again = ["COMMAND_LONG", "SET_GPS_GLOBAL_ORIGIN"]
     assert [m.get_type() for m in sent] == ["COMMAND_LONG"] * 3 + ["SET_GPS_GLOBAL_ORIGIN"] + again * 2
@@ -58,7 +58,7 @@ def test_the_origin_is_sent_after_three_replies_without_an_origin_and_again_unti
 
 
 def test_an_autopilot_keeps_its_origin():
-    sender = OriginSender(ORIGIN, (1, 1))
+    sender = OriginSender(ORIGIN, (1, 1), (1, 197))
     sent = run(sender, 30, ack(0), mavlink.MAVLink_gps_global_origin_message(1, 2, 3))
     assert [m.get_type() for m in sent] == ["COMMAND_LONG"]
     assert sender.state is OriginState.PRESENT
@@ -66,19 +66,19 @@ def test_an_autopilot_keeps_its_origin():
 
 @pytest.mark.parametrize("replies", [(), (ack(3),), (ack(1),), (ack(0, command=511),)])
 def test_an_autopilot_that_does_not_reply_gets_no_origin(replies: Any):
-    sender = OriginSender(ORIGIN, (1, 1))
+    sender = OriginSender(ORIGIN, (1, 1), (1, 197))
     assert {m.get_type() for m in run(sender, 30, *replies)} == {"COMMAND_LONG"}
 
 
 def test_a_reply_before_the_request_is_ignored():
-    sender = OriginSender(ORIGIN, (1, 1))
+    sender = OriginSender(ORIGIN, (1, 1), (1, 197))
     for _ in range(5):
         sender.on_message(ack(0))
     assert [m.get_type() for m in sender.due(HOST0)] == ["COMMAND_LONG"]
 
 
 def test_replies_to_another_requester_count_once_at_most():
-    sender = OriginSender(ORIGIN, (1, 1))
+    sender = OriginSender(ORIGIN, (1, 1), (1, 197))
     assert len(sender.due(HOST0)) == 1
     for _ in range(5):
         sender.on_message(ack(0))
@@ -86,7 +86,7 @@ def test_replies_to_another_requester_count_once_at_most():
 
 
 def test_an_origin_that_was_not_sent_is_sent_later():
-    sender = OriginSender(ORIGIN, (1, 1))
+    sender = OriginSender(ORIGIN, (1, 1), (1, 197))
     for i in range(3):
         sender.due(HOST0 + 1_100 * i * MS)
         sender.on_message(ack(0))
@@ -98,20 +98,20 @@ def test_an_origin_that_was_not_sent_is_sent_later():
 
 
 def test_an_autopilot_that_was_silent_is_asked_again():
-    sender = OriginSender(ORIGIN, (1, 1))
+    sender = OriginSender(ORIGIN, (1, 1), (1, 197))
     run(sender, 30, ack(0))
     assert sender.state is OriginState.SENT
     sender.restart()
     sent = run(sender, 30, ack(0), mavlink.MAVLink_gps_global_origin_message(1, 2, 3))
     assert [m.get_type() for m in sent] == ["COMMAND_LONG"]
     assert sender.state is OriginState.PRESENT
-    none = OriginSender(None, (1, 1))
+    none = OriginSender(None, (1, 1), (1, 197))
     none.restart()
     assert none.state is OriginState.NOT_CONFIGURED
 
 
 def test_without_an_origin_nothing_is_requested():
-    assert run(OriginSender(None, (1, 1)), 30, ack(0)) == []
+    assert run(OriginSender(None, (1, 1), (1, 197)), 30, ack(0)) == []
 
 
 def test_an_invalid_position_is_rejected():

@@ -34,9 +34,9 @@ ALL = [(profile, yaw) for profile in PROFILES for yaw in ("none", "measured")]
 def test_names_fit_the_message_field_and_each_has_a_reason(profile: ProfileName, yaw: YawOutput, source_set: int):
     required = required_parameters(profile, yaw, source_set)
     names = [parameter.name for parameter in required]
-    always = [parameter.name for parameter in required if parameter.when is None]
+    always = [parameter.name for parameter in required if not parameter.when]
     assert len(set(always)) == len(always)
-    assert {parameter.when[0] for parameter in required if parameter.when} <= {*always, "EK3_SRC1_POSXY"}
+    assert {name for parameter in required for name in parameter.when} <= {*always, "EK3_SRC1_POSXY"}
     assert all(0 < len(name) <= 16 for name in names)
     assert all(parameter.why for parameter in required)
     assert findings(required, best_values(required)) == []
@@ -90,6 +90,14 @@ def test_a_source_that_does_not_fit_what_is_sent_is_found(
         ("measured", {"EK3_SRC1_POSXY": 0.0, "EK3_SRC2_POSZ": 1.0}, "without a position in set 1"),
         ("measured", {"EK3_SRC1_POSXY": 3.0, "EK3_SRC2_POSZ": 1.0}, None),
         ("measured", {"EK3_SRC1_POSXY": 0.0, "EK3_SRC2_POSZ": 6.0}, None),
+        ("none", {"EK3_SRC3_POSXY": 0.0, "EK3_SRC3_VELXY": 0.0}, "the third position of the switch"),
+        ("none", {"EK3_SRC3_POSXY": 0.0, "EK3_SRC3_VELXY": 5.0}, None),  # optical flow
+        (
+            "measured",
+            {"EK3_SRC1_POSXY": 0.0, "EK3_SRC2_POSZ": 6.0, "EK3_SRC3_POSXY": 0.0, "EK3_SRC3_VELXY": 0.0},
+            None,  # set 1 has none either
+        ),
+        ("measured", {"EK3_SRC3_YAW": 0.0}, "the third position of the switch"),
     ],
 )
 def test_a_parameter_may_depend_on_another(yaw: YawOutput, changes: dict[str, float], why: str | None):

@@ -44,13 +44,15 @@ class Flight:
 
     def __init__(self, **parameters: float) -> None:
         self.texts: list[str] = []
-        self.switch = SourceSwitch(2, REQUIRED, (1, 1), (1, 197), self.texts.append, SIGMA_M)
+        self.switch = SourceSwitch(2, True, REQUIRED, (1, 1), (1, 197), self.texts.append, SIGMA_M)
         self.values = best_values(REQUIRED) | parameters
         self.now_ns, self.step = HOST0, 0
         self.results: list[int | None] = []  # of the next requests; then ACCEPTED; None: no answer
         self.requested: list[int] = []
         self.poses = self.armed = True
         self.mode, self.ratio, self.flags = 5, 0.1, POSITION
+        self.compass_ratio = 0.1
+        self.gps: tuple[int, int] | None = (3, 800)  # fix type, h_acc [mm]; None: not sent
         self.yaw_error_rad, self.compass_rad = 0.0, 0.0
         self.turn_rad = 0.0  # of map against the autopilot's axes
         self.measured = True
@@ -76,7 +78,10 @@ class Flight:
         x_m = self.step * 0.02
         if self.step % 25 == 1:
             give(mavlink.MAVLink_heartbeat_message(2, 3, 128 if self.armed else 0, self.mode, 4, 3))
-            give(mavlink.MAVLink_ekf_status_report_message(self.flags, 0.1, self.ratio, 0, 0, 0))
+            give(mavlink.MAVLink_ekf_status_report_message(self.flags, 0.1, self.ratio, 0, self.compass_ratio, 0))
+            if self.gps is not None:
+                fix, h_acc = self.gps
+                give(mavlink.MAVLink_gps_raw_int_message(0, fix, 0, 0, 0, 0, 0, 0, 0, 0, h_acc=h_acc))
         if self.flags == POSITION:
             v = self.own_speed_mps
             message = mavlink.MAVLink_local_position_ned_message(self.step * 20, 50 + v * x_m, 7, -30, v, 0, 0)
@@ -158,7 +163,7 @@ def test_the_set_is_requested_once_when_poses_are_sent_and_move_as_the_autopilot
 
 def test_nothing_is_requested_unless_configured():
     flight = Flight()
-    flight.switch = SourceSwitch(None, REQUIRED, (1, 1), (1, 197), flight.texts.append, SIGMA_M)
+    flight.switch = SourceSwitch(2, False, REQUIRED, (1, 1), (1, 197), flight.texts.append, SIGMA_M)
     assert flight.fly(20).requested == []
 
 
@@ -169,6 +174,7 @@ def test_nothing_is_requested_unless_configured():
         {"mode": 3},  # Auto: its target is in global coordinates
         {"mode": 6},  # RTL
         {"ratio": 0.6},
+        {"compass_ratio": 0.9},  # it would be kept, one of the two votes of the EKF failsafe
         {"measured": False},  # propagated without LiDAR
         {"own_speed_mps": 0.0},  # it hovers: the poses are of another object
         {"yaw_error_rad": math.radians(90)},
@@ -280,7 +286,7 @@ def test_an_acknowledgement_for_another_requester_is_not_ours():
     flight.fly(5.5)
     foreign = mavlink.MAVLink_command_ack_message(SET_EKF_SOURCE_SET, ACCEPTED, 0, 0, 255, 190)
     flight.switch.on_message(foreign, flight.now_ns)
-    assert flight.switch.active == 1
+    assert flight.switch.active is None
 
 
 def test_set_1_is_requested_when_poses_end_and_grds_set_again_when_they_have_returned():
@@ -296,6 +302,53 @@ def test_set_1_is_requested_when_poses_end_and_grds_set_again_when_they_have_ret
     flight.fly(4)
     assert flight.requested[-1] == 1
     assert flight.fly(10).requested[-1] == 2
+
+
+@pytest.mark.parametrize("gps", [(1, 0), (3, 8000)], ids=["no fix", "8 m"])
+def test_set_1_is_not_requested_while_its_gps_is_unusable(gps: tuple[int, int]):
+    """ArduPilot checks nothing at the command; on grd's set it flies on for 7 s."""
+    flight = Flight().fly(10)
+    flight.poses, flight.gps = False, gps
+    flight.fly(3)
+    assert flight.requested == [2]
+    assert flight.texts[-1] == "GPS unusable: source set 1 is not requested"
+    assert len(flight.texts) == 2
+    flight.poses = True
+    flight.fly(3)
+    flight.poses = False
+    flight.fly(1)
+    assert len(flight.texts) == 3
+    flight.gps = (3, 1500)
+    assert flight.fly(1).requested == [2, 1]
+
+
+@pytest.mark.parametrize("gps", [None, (3, 0)], ids=["not sent", "accuracy not reported"])
+def test_set_1_is_requested_where_nothing_is_known_of_its_gps(gps: tuple[int, int] | None):
+    flight = Flight()
+    flight.gps = gps
+    flight.fly(10)
+    flight.poses = False
+    assert flight.fly(2).requested == [2, 1]
+
+
+def test_the_first_position_of_the_switch_after_a_boot_is_no_selection_of_the_pilot():
+    flight = Flight()
+    assert flight.switch.uses_grd is None
+    flight.say("Using EKF Source Set 1")
+    assert flight.switch.uses_grd is False
+    assert flight.fly(20).requested == [2]
+    assert flight.switch.uses_grd is True
+
+
+def test_without_switch_source_the_selection_of_the_pilot_is_known():
+    flight = Flight()
+    flight.switch = SourceSwitch(2, False, REQUIRED, (1, 1), (1, 197), flight.texts.append, SIGMA_M)
+    for number, uses_grd in ((1, False), (2, True), (3, False)):
+        flight.say(f"Using EKF Source Set {number}")
+        assert flight.switch.uses_grd is uses_grd
+        assert flight.switch.status is None
+    flight.switch.on_boot()
+    assert flight.switch.uses_grd is None
 
 
 @pytest.mark.parametrize("source", [0.0, 6.0])
@@ -342,7 +395,7 @@ def test_a_reopened_link_knows_the_set_in_use_and_what_the_pilot_selected_until_
     for boot_ms in (60_000, 1_000):
         attitude = mavlink.MAVLink_attitude_message(boot_ms, 0, 0, 0, 0, 0, 0)
         list(second.receive(packed(attitude, mavlink.MAVLink(None, srcSystem=1, srcComponent=1)), PEER, HOST0))
-    assert second.switch.active == 1
+    assert second.switch.active is None
     assert second.switch.status is None
 
 
@@ -424,6 +477,15 @@ def test_after_a_yaw_reset_of_the_ekf_a_set_is_requested_only_while_the_velocity
     assert flight.texts[1:] == ["too fast for source set 1: slow down"]
     flight.own_speed_mps = 0.5
     assert flight.fly(1).requested == [2, 1]
+
+
+def test_a_flight_whose_gps_has_ended_stays_on_grds_set_in_a_gap_of_the_lidar():
+    config = ROOT / "configs/sim_flight_switch_fixes.yaml"
+    plan = [{"do": "path", "for_s": 20}, {"do": "square", "for_s": 30, "side_m": 8.0}]
+    settings = {"plan": plan, "source_sets": ["gps", "external_no_velocity"], "gps_until_s": 32.0}
+    stack = flown(config, "hover_fixes", settings, (34.0, 36.5))
+    assert [str(event) for event in stack.events] == ["plan: path", "plan: square", "source set 2"]
+    assert not stack.quadrotor.crashed
 
 
 def test_a_flight_that_follows_the_vehicle_at_speed_is_switched_to_gps_when_the_lidar_ends():

@@ -70,11 +70,15 @@ class Downlink:
         now_ns: int,
         tick: FlownTick,
         field_ut: Array64,
+        gps_raw: Callable[[int], Any],
         ekf: Estimators,
         device_ns_of: Callable[[int], int],
         heartbeat: Any,
     ) -> None:
-        """Send what is due in a tick, in the middle of each step of the main loop; field_ut: magnetic field (3,)."""
+        """Send what is due in a tick, in the middle of each step of the main loop.
+
+        field_ut: magnetic field (3,); `gps_raw`: GPS_RAW_INT at a time of the device.
+        """
         reported = ekf.reported
         other = None if reported is ekf.primary else reported.lane.output()[0:10]
         for step in range(STEPS):
@@ -84,6 +88,8 @@ class Downlink:
             for message in self.streams.due(device_ns):
                 if message == streams.HEARTBEAT:
                     self._waiting.append(heartbeat)
+                elif message == streams.GPS_RAW_INT:
+                    self._waiting.append(gps_raw(device_ns))
                 elif (built := _message(message, device_ns, ekf, estimate, tick.samples[step], field_ut)) is not None:
                     self._waiting.append(built)
             while self._waiting:

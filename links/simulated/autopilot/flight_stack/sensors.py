@@ -44,6 +44,8 @@ class Sensors:
         self._baro_bias = Wander(np.array([baro.bias_m]), baro.bias_time_s, rng)
         self._baro_first = float(self._baro_bias.at(0.0)[0])  # calibrated at boot: height 0
         self.magnetometer = Magnetometer(settings.compass, seed)
+        self.gps_fix: GpsFix | None = None
+        """The newest fix; None: there is none any more, or not yet."""
         self._gps_waiting: deque[tuple[float, GpsFix]] = deque()
         self._next_s = {"gps": 0.0, "compass": 0.0, "baro": 0.0}
 
@@ -61,7 +63,8 @@ class Sensors:
         thrust_g: thrust over weight.
         """
         s, rng = self._settings, self._rng
-        if s.gps_available and self._due("gps", time_s, s.gps.rate_hz):
+        has_gps = s.gps_until_s is None or time_s < s.gps_until_s
+        if has_gps and self._due("gps", time_s, s.gps.rate_hz):
             xyz = xyz_m + self._gps_bias.at(time_s) + s.gps.white_m * rng.standard_normal(3)
             velocity = velocity_mps + s.gps.velocity_mps * rng.standard_normal(3)
             arrives_ns = device_ns + round(NS * (s.gps.delay_s - s.gps.assumed_delay_s))
@@ -69,6 +72,7 @@ class Sensors:
         fixes: list[GpsFix] = []
         while self._gps_waiting and self._gps_waiting[0][0] <= time_s:
             fixes.append(self._gps_waiting.popleft()[1])
+        self.gps_fix = (fixes[-1] if fixes else self.gps_fix) if has_gps else None
         self.magnetometer.sample(time_s, R_odom_drone, thrust_g)
         yaws: list[float] = []
         if self._due("compass", time_s, COMPASS_HZ):

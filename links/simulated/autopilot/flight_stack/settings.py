@@ -134,7 +134,7 @@ class TakeOff(StrictModel):
 
 
 class UseSources(StrictModel):
-    """MAV_CMD_SET_EKF_SOURCE_SET of the pilot, at once."""
+    """The pilot selects a source set by the remote control, at once."""
 
     do: Literal["use_sources"] = "use_sources"
     set: int = Field(ge=1, le=3)
@@ -155,7 +155,7 @@ class FlightStackSettings(StrictModel):
     on_ground: bool = False  # start on the ground, disarmed, below the start of the path
     lanes: int = Field(default=1, ge=1, le=2)  # EKF cores, each with its own IMU
     independent_telemetry: bool = False  # a test instrument: telemetry of a second EKF that uses the first set only
-    gps_available: bool = True
+    gps_until_s: float | None = Field(default=None, ge=0)  # GPS has no fix from then on; None: it always has one
     imu: ImuSettings = ImuSettings()
     gps: GpsSettings = GpsSettings()
     compass: CompassSettings = CompassSettings()

@@ -40,10 +40,12 @@ from links.simulated.autopilot.flight_stack.outcomes.events import EventKind, Fl
 from links.simulated.autopilot.flight_stack.quadrotor import TICK_S, Quadrotor
 from links.simulated.autopilot.flight_stack.sensors import Sensors
 from links.simulated.autopilot.flight_stack.settings import Hold, TakeOff, UseSources
+from links.simulated.autopilot.flight_stack.telemetry import gps_raw
 from links.simulated.autopilot.radio import Radio
 from links.simulated.kernels.airframe import QUATERNION, THRUST
 from links.simulated.kernels.motion import GRAVITY_MPS2
 from links.simulated.world.path import Path
+from stages.cues.geodesy import Geographic, moved
 from stages.geometry.frames import Array64, heading_rad, rotation_from_quaternion_xyzw, rotation_z
 
 mavlink: Any = ardupilotmega
@@ -149,7 +151,6 @@ class FlightStack:
         if not self.ekf.use_set(number - 1):
             return False
         self._switched_s, self._frame_before = self._tick * TICK_S, frame
-        self.text(6, f"Using EKF Source Set {number}")
         self._note(EventKind.SOURCE_SET, number=number)
         return True
 
@@ -211,7 +212,13 @@ class FlightStack:
         self.ekf.step(self.device_ns(now_ns + TICK_NS), tick.moved)
         if alive:
             self._downlink.send_due(
-                now_ns, tick, self._sensors.magnetometer.field_ut, self.ekf, self.device_ns, self._heartbeat()
+                now_ns,
+                tick,
+                self._sensors.magnetometer.field_ut,
+                self._gps_raw,
+                self.ekf,
+                self.device_ns,
+                self._heartbeat(),
             )
 
     def _command(self, time_s: float, estimate: Array64) -> Array64:
@@ -264,7 +271,8 @@ class FlightStack:
             step = self._plan.popleft()
             self._step_ends_s += step.for_s
             if isinstance(step, UseSources):
-                self.use_sources(step.set)
+                if self.use_sources(step.set) and not self.px4:
+                    self.text(6, f"Using EKF Source Set {step.set}")
                 continue
             self._note(EventKind.PLAN, step.do, holds=isinstance(step, Hold))
             self._guidance.begin(step, time_s)
@@ -329,6 +337,16 @@ class FlightStack:
         self._check = EkfCheck()
 
     # --- status ---
+
+    def _gps_raw(self, device_ns: int) -> Any:
+        """GPS_RAW_INT: the newest fix, in axes x north, y west, z up from home."""
+        fix, position = self._sensors.gps_fix, None
+        if fix is not None:
+            north, west, up = fix.xyz_m.tolist()
+            latitude, longitude, altitude_mm = ORIGIN
+            home = Geographic(math.radians(1e-7 * latitude), math.radians(1e-7 * longitude), 1e-3 * altitude_mm)
+            position = moved(home, np.array([-west, north, up]))
+        return gps_raw(device_ns, position, self.settings.gps.reported_m)
 
     def _heartbeat(self) -> Any:
         base = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | (mavlink.MAV_MODE_FLAG_SAFETY_ARMED if self.armed else 0)

@@ -21,11 +21,13 @@ from links.mavlink.ned_frd import (
     upper_from_velocity_covariance,
     wxyz_from_R_odom_drone,
 )
+from stages.cues.geodesy import Geographic
 from stages.geometry.frames import Array64, rotation_from_quaternion_xyzw
 
 mavlink: Any = ardupilotmega
 STANDARD_GRAVITY_MPS2 = 9.80665
 INT16 = 32767
+NO_FIX, FIX_3D, UNKNOWN, SATELLITES = 1, 3, 65_535, 14  # GPS_FIX_TYPE; fields that are not known; of a good fix
 MS, US = 1_000_000, 1_000
 
 
@@ -79,6 +81,17 @@ def highres_imu(device_ns: int, sample: Array64, field_ut: Array64) -> Any:
     """HIGHRES_IMU (PX4), SI units and gauss."""
     values = [*flip_yz(sample[3:6]).tolist(), *flip_yz(sample[0:3]).tolist(), *flip_yz(0.01 * field_ut).tolist()]
     return mavlink.MAVLink_highres_imu_message(device_ns // US, *values, *[0.0] * 4, 0b111_111_111)
+
+
+def gps_raw(device_ns: int, fix: Geographic | None, sigma_m: float) -> Any:
+    """GPS_RAW_INT of the newest fix, with its horizontal accuracy; None: no fix."""
+    if fix is None:
+        return mavlink.MAVLink_gps_raw_int_message(device_ns // US, NO_FIX, 0, 0, 0, *[UNKNOWN] * 4, 0)
+    position = round(1e7 * math.degrees(fix.latitude_rad)), round(1e7 * math.degrees(fix.longitude_rad))
+    altitude_mm, accuracy_mm = round(1e3 * fix.altitude_m), round(1e3 * sigma_m)
+    return mavlink.MAVLink_gps_raw_int_message(
+        device_ns // US, FIX_3D, *position, altitude_mm, *[UNKNOWN] * 4, SATELLITES, h_acc=accuracy_mm
+    )
 
 
 def field_counts(field_ut: Array64) -> list[int]:

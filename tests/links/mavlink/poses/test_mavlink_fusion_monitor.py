@@ -20,6 +20,14 @@ def report(ratio: float) -> Any:
     return mavlink.MAVLink_ekf_status_report_message(0, 0.1, ratio, 0.1, 0.1, 0.0)
 
 
+def report_of_yaw(ratio: float) -> Any:
+    return mavlink.MAVLink_ekf_status_report_message(0, 0.1, 0.2, 0.1, ratio, 0.0)
+
+
+def ardupilot_gps_glitch(ratio: float) -> Any:
+    return mavlink.MAVLink_ekf_status_report_message(mavlink.EKF_GPS_GLITCHING, 0.1, ratio, 0.1, 0.1, 0.0)
+
+
 def estimator_status(ratio: float, flags: int = 0) -> Any:
     return mavlink.MAVLink_estimator_status_message(0, flags, 0.1, ratio, 0.1, 0.1, 0.0, 0.0, 0.1, 0.1)
 
@@ -36,6 +44,7 @@ class Flight:
         self.now_ns = HOST0
         self.counters: list[int] = []
         self.texts: list[str] = []
+        self.uses_grd: bool | None = None
 
     def fly(self, seconds: float, ratio: float, message: Any = report) -> int:
         """Number of poses sent."""
@@ -43,7 +52,7 @@ class Flight:
         for i in range(round(50 * seconds)):
             self.now_ns += 20 * MS
             if i % 10 == 0:
-                self.sender.on_estimator_status(message(ratio), self.now_ns)
+                self.sender.on_estimator_status(message(ratio), self.now_ns, self.uses_grd)
             pose = good_pose(self.now_ns)
             messages = self.sender.messages(pose, self.now_ns)
             if messages:
@@ -54,18 +63,74 @@ class Flight:
         return sent
 
 
-@pytest.mark.parametrize("message", [report, estimator_status])
-def test_a_rejected_pose_ends_the_stream_until_the_ratio_is_small_again(message: Any):
+@pytest.mark.parametrize(("message", "uses_grd", "not_small"), [(report, True, 0.8), (estimator_status, None, 1.1)])
+def test_a_rejected_pose_ends_the_stream_until_the_ratio_is_small_again(
+    message: Any, uses_grd: bool | None, not_small: float
+):
     flight = Flight()
+    flight.uses_grd = uses_grd
     assert flight.fly(2.0, 0.3, message) == 100
     assert 30 <= flight.fly(2.0, 1.4, message) <= 40
     assert flight.sender.rejected[RejectReason.REJECTED_BY_AUTOPILOT] >= 60
-    assert flight.fly(2.0, 0.8, message) == 0  # not small
+    assert flight.fly(2.0, not_small, message) == 0
     assert flight.fly(2.9, 0.3, message) == 0
     assert flight.fly(2.0, 0.3, message) > 80
     assert flight.counters[-1] == flight.counters[0] + 1  # the gap
-    assert "grd: STOPPED: autopilot rejects the position" in flight.texts
+    assert "grd: STOPPED: autopilot rejects the pose" in flight.texts
     assert "grd: autopilot rejects the position (1.4)" in flight.texts
+
+
+def test_the_ratio_of_another_source_set_is_not_that_of_the_pose():
+    """ArduPilot flies on GPS, which it rejects next to buildings."""
+    flight = Flight()
+    flight.uses_grd = False
+    assert flight.fly(5.0, 1.4) == 250
+    assert flight.sender.fusion.rejections == 0
+
+
+def test_poses_are_sent_again_after_the_change_to_another_set():
+    flight = Flight()
+    flight.uses_grd = True
+    assert flight.fly(2.0, 1.4) < 50
+    flight.uses_grd = False
+    assert flight.fly(2.9, 1.4) == 0
+    assert flight.fly(2.0, 1.4) > 80
+
+
+def test_of_an_unknown_set_a_ratio_below_the_gate_is_enough():
+    """The drone flies on GPS, whose ratio stays high near buildings."""
+    flight = Flight()
+    assert flight.fly(2.0, 1.4) < 50
+    assert flight.fly(2.9, 0.8) == 0
+    assert flight.fly(2.0, 0.8) > 80
+
+
+@pytest.mark.parametrize("on_rejection", ["stop", "reset"])
+def test_a_rejected_yaw_ends_the_stream(on_rejection: Any):
+    """ArduPilot fuses no other yaw for the rest of the flight, also after a reset of the position."""
+    flight = Flight(on_rejection)
+    flight.uses_grd = True
+    assert flight.fly(2.0, 0.3, report_of_yaw) == 100
+    assert 30 <= flight.fly(2.0, 1.4, report_of_yaw) <= 40
+    flight.fly(2.0, 1.4, report_of_yaw)
+    assert "grd: autopilot rejects the yaw (1.4)" in flight.texts
+
+
+def test_the_ratio_that_the_compass_had_at_the_switch_is_not_that_of_the_yaw():
+    flight = Flight()
+    assert flight.fly(1.0, 1.3, report_of_yaw) == 50
+    flight.uses_grd = True
+    assert flight.fly(3.0, 1.3, report_of_yaw) == 150  # kept since then
+    assert flight.fly(2.0, 1.5, report_of_yaw) < 50
+
+
+def test_a_rejected_compass_is_not_that_of_a_position_without_yaw():
+    flight = Flight()
+    flight.sender = PoseSender(("vision_position_estimate",), PoseLimits(), yaw="none")
+    assert flight.sender.fusion.add(report_of_yaw(0.1), True, HOST0, True, flight.sender.sends_yaw) is None
+    for k in range(20):
+        now_ns = HOST0 + 200 * k * MS
+        assert flight.sender.fusion.add(report_of_yaw(3.0), True, now_ns, True, flight.sender.sends_yaw) is None
 
 
 def test_a_short_rejection_ends_nothing():
@@ -117,10 +182,11 @@ def test_px4_that_fuses_nothing_any_more_receives_poses_again():
     assert flight.fly(2.0, 0.2, estimator_status) == 100
 
 
-def test_a_ratio_during_a_gps_glitch_is_not_that_of_the_pose():
+@pytest.mark.parametrize(("glitch", "status"), [(gps_glitch, estimator_status), (ardupilot_gps_glitch, report)])
+def test_a_ratio_during_a_gps_glitch_is_not_that_of_the_pose(glitch: Any, status: Any):
     flight = Flight()
-    assert flight.fly(3.0, 1.4, gps_glitch) == 150
-    assert flight.fly(3.0, 1.4, estimator_status) < 50
+    assert flight.fly(3.0, 1.4, glitch) == 150
+    assert flight.fly(3.0, 1.4, status) < 50
 
 
 def test_after_a_stop_a_small_ratio_counts_whatever_the_flag_says():

@@ -38,6 +38,11 @@ def check_loop(graph: Graph, scenario: Scenario) -> None:
             "its fixes: use configs/sim_flight_fixes.yaml, or one that includes it"
         )
     stack = None if scenario.autopilot is None else scenario.autopilot.flight_stack
+    if stack is not None and graph.left_out:
+        raise LinkError(
+            f"the rig of the scenario {scenario.name} lacks what the configuration needs: "
+            f"{'; '.join(graph.left_out_texts())}. Use another configuration or scenario"
+        )
     if stack is not None and not (has_autopilot(graph) and pose_edge(graph)[1]):
         raise LinkError(
             f"the autopilot of the scenario {scenario.name} flies on poses of grd (flight_stack), and the "

@@ -61,6 +61,7 @@ def test_a_wrong_setting_is_an_error_before_the_first_flight(tmp_path: Path) -> 
             "has a fix_sensor instead of a LiDAR, and the configuration does not take its fixes",
         ),
         ("hover_fixes", "sim_flight", "has a fix_sensor instead of a LiDAR"),
+        ("hover_fixes", "sim_flight_cameras_fixes", r"lacks what the configuration needs: .* no \$rig\.cameras"),
         ("hover", "sim_flight_fixes", "has no fix_sensor, and the configuration takes its fixes"),
         (
             "hover",

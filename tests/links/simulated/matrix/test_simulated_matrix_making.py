@@ -153,13 +153,16 @@ def test_a_failed_flight_leaves_no_run_folder(tmp_path, config: Path, monkeypatc
     assert list((tmp_path / "runs").iterdir()) == []
 
 
-def test_a_configuration_with_cameras_needs_a_rig_with_cameras(tmp_path, monkeypatch) -> None:
+def test_the_rig_has_cameras_where_the_conditions_have(tmp_path, monkeypatch) -> None:
+    """Without them `vision.yaml` is `estimate.yaml`."""
     monkeypatch.setattr(flights, "USUAL_DURATION_S", 0.2)
     vision = Path(__file__).resolve().parents[4] / "configs" / "vision.yaml"
-    with pytest.raises(ConfigError, match="rig has no 'cameras'"):
-        make_matrix(tmp_path, [HOVER], range(1, 2), vision, silent, results=tmp_path / "runs")
+    report = make_matrix(tmp_path / "blind", [HOVER], range(1, 2), vision, silent, results=tmp_path / "runs")
+    assert (report.made, report.failed) == (1, ())
+    with RecordingReader(tmp_path / "blind/open_lot-10m-hover-parked-s1.mcap") as reader:
+        assert "masked_px" not in str(reader.rig_yaml)
     seen = Conditions(cameras_hz=1.0)
-    report = make_matrix(tmp_path, [HOVER], range(1, 2), vision, silent, seen, results=tmp_path / "runs")
+    report = make_matrix(tmp_path, [HOVER], range(1, 2), vision, silent, seen, results=tmp_path / "seen_runs")
     assert (report.made, report.failed) == (1, ())
     with RecordingReader(tmp_path / "open_lot-10m-hover-parked-s1.mcap") as reader:
         assert reader.rig_yaml is not None

@@ -256,6 +256,7 @@ class AutopilotSession:
                 if self._now_ns() - self._target_ns > SILENCE_REPORTED_S * SECOND_NS:
                     self.origin.restart()
                     self.intervals.restart()
+                    self.switch.on_silence()
                 if not self._is_reachable(self._now_ns()):
                     self._timesync.reset()
                 self._timesync.on_frame()

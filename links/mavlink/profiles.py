@@ -204,18 +204,18 @@ def _ardupilot(yaw: YawOutput, source_set: int) -> tuple[RequiredParameter, ...]
         RequiredParameter("EK3_SRC1_YAW", (1.0, 2.0, 3.0), why=without_grd),
     )
     spare = f"EK3_SRC{5 - source_set}_"  # selected by the third position of the switch
-    hit_by_mistake = "the third position of the switch selects it, and a set without sources loses position and yaw"
+    hit_by_mistake = "the pilot's switch can select it, and a set without sources loses position and yaw"
+    not_grd = "grd's poses belong in its own set"
     spare_set = (
         RequiredParameter(
             spare + "POSXY",
-            (GPS, 4.0, EXTERNAL),
+            (GPS, 4.0),
             when={"EK3_SRC1_POSXY": GPS, spare + "VELXY": 0.0},
             why=f"as set 1: {hit_by_mistake}",
         ),
-        RequiredParameter(
-            spare + "VELXY", (3.0, 0.0, 4.0, 5.0, EXTERNAL, 7.0), why="velocity of the set that grd does not use"
-        ),
-        RequiredParameter(spare + "YAW", (1.0, 2.0, 3.0, EXTERNAL, 8.0), why=f"as set 1: {hit_by_mistake}"),
+        RequiredParameter(spare + "POSXY", (GPS, 0.0, 4.0), why=not_grd),
+        RequiredParameter(spare + "VELXY", (3.0, 0.0, 4.0, 5.0, 7.0), why=not_grd),
+        RequiredParameter(spare + "YAW", (1.0, 2.0, 3.0, 8.0), why=f"as set 1: {hit_by_mistake}"),
     )
     return (
         RequiredParameter("AHRS_EKF_TYPE", (3.0,), why="only EKF3 fuses an external pose"),

@@ -14,14 +14,16 @@ The switch to grd's set is requested (MAV_CMD_SET_EKF_SOURCE_SET) while all of t
 A request that is denied, or that is not acknowledged three times, is not repeated until the autopilot boots. Nor is any
 after somebody else has selected another set: ArduPilot names a set that its remote control selects in a STATUSTEXT. It
 acknowledges our command without a text, and reports nowhere which set is in use: after a boot, or a start of grd, it is
-unknown until a text or an acknowledgement.
+unknown until a text or an acknowledgement, as after a request of ours until its acknowledgement, after one of another
+station, and after a silence.
 
 Set 1 is requested FALLBACK_AFTER_NS after the last pose, once a second until it is acknowledged, if its position is
-from another source than grd, and GPS has a fix that EKF3 would use. ArduPilot alone does not return to it, and checks
-nothing at the command. On grd's set it flies on for 7 s without a position: poses that return within that time are
-better than a set 1 without GPS. Without a connection, or after the end of grd, nothing is requested: the pilot has to
-switch. Neither does grd that was restarted in flight request set 1 before it has requested its own set again, because
-it does not know which set is in use.
+from another source than grd, and GPS (its first receiver) has a 3D fix; with one worse than MAX_GPS_SIGMA_M only
+GPS_WAIT_NS after the last pose. ArduPilot alone does not return to it, and checks nothing at the command. On grd's set
+it flies on for 7 s without a position: poses that return within that time are better than a set 1 without GPS. Without
+a connection, or after the end of grd, nothing is requested: the pilot has to switch. Neither does grd that was
+restarted in flight request set 1 before it has requested its own set again, because it does not know which set is in
+use.
 
 Poses with yaw are in axes parallel to those that the autopilot had at the first one. If its EKF has reset its yaw
 since, they are not parallel any more. With the source of the yaw the EKF turns its axes, but not its velocity:
@@ -62,8 +64,9 @@ MAX_FIX_AGE_NS = 1_000_000_000  # age of the LiDAR position in a pose
 MAX_STATUS_AGE_NS = 2_000_000_000  # age of the EKF's status
 MAX_RATIO = 0.5  # test ratio; above 1 the EKF rejects
 FAILSAFE_RATIO = 0.8  # FS_EKF_THRESH
-MAX_GPS_SIGMA_M = 5.0  # as EKF3 requires before it uses GPS
-GPS_STATUS_HZ = 2.0  # rate at which GPS_RAW_INT is requested for it
+MAX_GPS_SIGMA_M = 5.0  # as EKF3 requires before it begins to use GPS
+GPS_WAIT_NS, MAX_GPS_AGE_NS = 4_000_000_000, 2_500_000_000  # ours: before the EKF's 7 s; two messages of 1 Hz
+GPS_STATUS_HZ = 1.0  # rate at which GPS_RAW_INT is requested for it
 MAX_TURNED_MPS = 1.0  # ours, chosen: error of the EKF's velocity after a change of axes
 HYSTERESIS_M = 2.0  # below FAR_M, from which a switch is requested again
 TRIES = 3
@@ -96,13 +99,15 @@ class SourceSwitch:
 
         It uses set 1, unless the switch of the remote control selects another one at once.
         """
-        self.active: int | None = None
+        self.active: int | None = FIRST_SET if self._set == FIRST_SET else None
         """The set in use; None: not known."""
+        self._may_be_own = False  # grd's set was requested, and it is not known whether it is in use
+        self._before: int | None = None  # set in use before that request
         self._values: dict[str, float] = {}
         self._parameter_requests, self._parameter_ns = 0, 0
         self._armed, self._mode = False, -1
         self._status: tuple[int, Any] | None = None  # arrival and message
-        self._gps: Any | None = None  # newest GPS_RAW_INT
+        self._gps: tuple[int, Any] | None = None  # arrival and newest GPS_RAW_INT
         self._position_ns = 0  # newest LOCAL_POSITION_NED
         self._speed_mps = 0.0  # of it, horizontal
         self._step_m: float | None = None  # of the position at a switch, if it is too large
@@ -125,6 +130,9 @@ class SourceSwitch:
             return f"source set {self._set} is not requested: {self._blocked}"
         read = not self._missing() or self._parameter_requests >= TRIES * len(self._required)
         wrong = findings(self._required, self._values) if read else []
+        ratio = math.nan if self._status is None else float(self._status[1].compass_variance)
+        if ratio >= FAILSAFE_RATIO and self.active != self._set:
+            wrong.append(f"the EKF's test ratio of the compass is {ratio:.1f}; switch by hand, or move away from steel")
         if self._step_m is not None and self.active != self._set:
             wrong.append(f"the position would move by {self._step_m:.0f} m; land and reboot the autopilot")
         return f"source set {self._set} is not requested: {wrong[0]}" if wrong else None
@@ -139,6 +147,8 @@ class SourceSwitch:
         kind = message.get_type()
         if kind == "STATUSTEXT":
             self._on_text(message.text)
+        elif kind == "COMMAND_ACK" and message.command == SET_EKF_SOURCE_SET:
+            self._on_result(message.result, is_answer(message, SET_EKF_SOURCE_SET, self._own))
         elif not self._enabled:
             return
         elif kind == "HEARTBEAT":
@@ -150,9 +160,12 @@ class SourceSwitch:
         elif kind == "PARAM_VALUE" and message.param_id in self._missing():
             self._values[message.param_id] = float(message.param_value)
         elif kind == "GPS_RAW_INT":
-            self._gps = message
-        elif is_answer(message, SET_EKF_SOURCE_SET, self._own):
-            self._on_result(message.result)
+            self._gps = arrival_ns, message
+
+    def on_silence(self) -> None:
+        """The autopilot was silent: a selection of another set may have been missed."""
+        if self.active != self._set:
+            self.active = FIRST_SET if self._set == FIRST_SET else None
 
     def on_sent(
         self,
@@ -195,8 +208,9 @@ class SourceSwitch:
         if self._pending is not None:
             return self._repeated(*self._pending, now_ns)
         ended = self._sent is not None and now_ns - self._sent_ns > FALLBACK_AFTER_NS
-        if self.active == self._set and ended and self._has_other_position():
-            reason = self._why_not_first_set()
+        may_be_own = self.active == self._set or (self.active is None and self._may_be_own)
+        if may_be_own and ended and self._has_other_position():
+            reason = self._why_not_first_set(now_ns)
             if not reason:
                 return self._request(FIRST_SET, now_ns)
             if reason != self._warned:
@@ -245,11 +259,13 @@ class SourceSwitch:
         """Whether set 1 has a position of another source than grd."""
         return self._values.get("EK3_SRC1_POSXY", 0.0) not in (0.0, EXTERNAL)
 
-    def _why_not_first_set(self) -> str:
+    def _why_not_first_set(self, now_ns: int) -> str:
         """Why set 1 is worse than grd's without poses; empty: it is not, as far as is known."""
-        gps = self._gps if self._values.get("EK3_SRC1_POSXY") == GPS else None
-        if gps is not None and (gps.fix_type < FIX_3D or 1e-3 * gps.h_acc > MAX_GPS_SIGMA_M):  # 0: not reported
-            return "GPS unusable: source set 1 is not requested"
+        if self._values.get("EK3_SRC1_POSXY") == GPS and self._gps and now_ns - self._gps[0] < MAX_GPS_AGE_NS:
+            gps = self._gps[1]
+            waits = now_ns - self._sent_ns < GPS_WAIT_NS
+            if gps.fix_type < FIX_3D or (waits and 1e-3 * gps.h_acc > MAX_GPS_SIGMA_M):  # 0: not reported
+                return "GPS unusable: source set 1 is not requested"
         return "" if self._is_slow() else "too fast for source set 1: slow down"
 
     def _missing(self) -> list[str]:
@@ -268,6 +284,9 @@ class SourceSwitch:
 
     def _request(self, number: int, now_ns: int) -> Any:
         self.requests += self._pending is None
+        if number == self._set and self.active is not None:
+            self._before, self.active = self.active, None
+        self._may_be_own = number == self._set or self._may_be_own
         self._pending = number, now_ns
         self._tries += 1
         return command_long(self._target, SET_EKF_SOURCE_SET, float(number))
@@ -283,14 +302,19 @@ class SourceSwitch:
             return None
         return self._request(number, now_ns)
 
-    def _on_result(self, result: int) -> None:
-        if self._pending is None or result in (IN_PROGRESS, TEMPORARILY_REJECTED):
+    def _on_result(self, result: int, ours: bool) -> None:
+        if not ours or self._pending is None:
+            if result == ACCEPTED:  # of another station, or to a request that was given up
+                self.active, self._may_be_own = None, True
+            return
+        if result in (IN_PROGRESS, TEMPORARILY_REJECTED):
             return
         number, self._pending, self._tries = self._pending[0], None, 0
         if result == ACCEPTED:
-            self.active = number
+            self.active, self._may_be_own = number, False
             self._warn(f"autopilot uses source set {number}")
         elif number == self._set:
+            self.active, self._may_be_own = self._before, False
             self._block(f"rejected, MAV_RESULT {result}")
         else:
             self.active = None  # not known
@@ -301,11 +325,12 @@ class SourceSwitch:
         found = USING.search(text)
         if found is None:
             return
-        number, requested = int(found[1]), self._pending[0] if self._pending else self.active or FIRST_SET
+        usual = None if self._armed else FIRST_SET  # before take-off it is the position of the switch at power-on
+        number, requested = int(found[1]), self._pending[0] if self._pending else self.active or usual
         if self._enabled and number not in (self._set, requested):
             self._pending, self._tries = None, 0
             self._block(f"the pilot selected set {number}")
-        self.active = number
+        self.active, self._may_be_own = number, False
 
     def _block(self, reason: str) -> None:
         self._blocked = reason

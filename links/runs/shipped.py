@@ -26,7 +26,7 @@ def shipped(path: Path) -> Path:
 
 def shipped_scenario(path: Path) -> Path:
     """The same for a scenario."""
-    return _shipped(path, {SCENARIOS: ".yaml"})
+    return _shipped(path, {SCENARIOS: ".yaml", CONFIGS: ".yaml"})
 
 
 def _shipped(path: Path, folders: dict[Path, str]) -> Path:

@@ -139,15 +139,17 @@ class TruthLog:
     def write(self, folder: Path) -> None:
         """Write the truth of the vehicle and of each drone into the folder of a run; no file when there is no truth.
 
-        When there are vehicle poses and no drone, the file states that.
+        When there are vehicle poses and no drone, the file states that, unless its records were invalid.
         """
         if any(drone.pose for drone in self.drones.values()):
             for number, drone in self.drones.items():
+                if not drone.pose:
+                    continue
                 self._write_drone(folder, number, drone)
             lines = [tum_line(stamp, np.asarray(t), q) for stamp, (t, q) in sorted(self.vehicle.items())]
             header = f"# T_world_vehicle, {FULL_POSE}, truth\n"
             (folder / TRUTH_VEHICLE_FILE).write_text(header + "".join(lines), encoding="utf-8")
-        elif self.vehicle:
+        elif self.vehicle and not any(map(DRONE_TOPIC.fullmatch, self.invalid)):
             (folder / TRUTH_FILE).write_text(f"# {NO_DRONE} in this recording\n", encoding="utf-8")
 
     def _write_drone(self, folder: Path, number: int, drone: TrueDrone) -> None:

@@ -62,7 +62,7 @@ class StatusTexts:
 
     def on_sending(self, now_ns: int) -> None:
         """Poses are sent from now on."""
-        self._sending_ns, self._repeats = now_ns, 0
+        self._sending_ns = now_ns
 
     def on_stopped(self, reason: str) -> None:
         """No poses are sent from now on."""
@@ -79,7 +79,8 @@ class StatusTexts:
     def due(self, now_ns: int) -> list[Any]:
         """The STATUSTEXT to send now, if any."""
         self._queue(now_ns)
-        if not (self._waiting or self._repeats):
+        repeats = self._repeats > 0 and self._sending_ns is None
+        if not (self._waiting or repeats):
             return []
         if self._text_ns is not None and 0 <= now_ns - self._text_ns < MIN_TEXT_INTERVAL_NS:
             return []
@@ -102,7 +103,7 @@ class StatusTexts:
     def _queue(self, now_ns: int) -> None:
         sending_ns = self._sending_ns
         if sending_ns is not None and not self._sending_reported and now_ns - sending_ns >= MIN_STATE_DURATION_NS:
-            self._sending_reported = True
+            self._sending_reported, self._repeats = True, 0
             self._waiting["output"] = NOTICE, "sending poses"
         if self._state is None:
             return

@@ -69,7 +69,7 @@ class MessageRates(StrictModel):
     attitude_hz: float = Field(default=25.0, ge=0, le=400)
     position_hz: float = Field(default=25.0, ge=0, le=400)
     estimator_hz: float = Field(default=5.0, ge=0, le=50)
-    # GPS_RAW_INT and GLOBAL_POSITION_INT, for cues; with `switch_source` GPS_RAW_INT is requested at 2 Hz all the same
+    # GPS_RAW_INT and GLOBAL_POSITION_INT, for cues; with `switch_source` GPS_RAW_INT is requested at 1 Hz all the same
     gnss_hz: float = Field(default=0.0, ge=0, le=50)
 
 

@@ -59,6 +59,7 @@ def test_the_name_of_a_scenario_is_not_that_of_a_recording(tmp_path, monkeypatch
     monkeypatch.chdir(tmp_path)
     for name in ("experiment_1", "experiment_1.yaml", "configs/scenarios/experiment_1.yaml"):
         assert shipped_scenario(Path(name)) == SCENARIOS / "experiment_1.yaml"
+    assert shipped_scenario(Path("scenarios/experiment_1.yaml")) == SCENARIOS / "experiment_1.yaml"
     assert shipped_scenario(Path("flight/none.yaml")) == Path("flight/none.yaml")
 
 

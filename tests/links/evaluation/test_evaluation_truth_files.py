@@ -124,6 +124,15 @@ def test_invalid_truth_is_counted_and_left_out(topic, data):
     assert not log.drones or (log.drones[1].pose, log.drones[1].return_ns, log.drones[1].visible) == ({}, None, None)
 
 
+@pytest.mark.parametrize(("drone", "stated"), [(None, True), (b"no", False)])
+def test_a_drone_whose_truth_is_invalid_is_not_stated_to_be_absent(drone, stated, tmp_path):
+    log = TruthLog()
+    pose = b'{"xyz_m": [0, 0, 0], "quaternion_xyzw": [0, 0, 0, 1]}'
+    log.add_all([Record("/truth/vehicle", 3, 3, pose)] + ([Record("/truth/drone", 3, 3, drone)] if drone else []))
+    log.write(tmp_path)
+    assert (tmp_path / "truth_vehicle_drone.tum").exists() is stated
+
+
 def fix(stamp_ns: int, z_m: float, track_id: int) -> DroneFix:
     where = np.array([0.0, 0.0, z_m])
     return DroneFix(

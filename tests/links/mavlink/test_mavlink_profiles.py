@@ -90,14 +90,16 @@ def test_a_source_that_does_not_fit_what_is_sent_is_found(
         ("measured", {"EK3_SRC1_POSXY": 0.0, "EK3_SRC2_POSZ": 1.0}, "without a position in set 1"),
         ("measured", {"EK3_SRC1_POSXY": 3.0, "EK3_SRC2_POSZ": 1.0}, None),
         ("measured", {"EK3_SRC1_POSXY": 0.0, "EK3_SRC2_POSZ": 6.0}, None),
-        ("none", {"EK3_SRC3_POSXY": 0.0, "EK3_SRC3_VELXY": 0.0}, "the third position of the switch"),
+        ("none", {"EK3_SRC3_POSXY": 0.0, "EK3_SRC3_VELXY": 0.0}, "the pilot's switch can select it"),
         ("none", {"EK3_SRC3_POSXY": 0.0, "EK3_SRC3_VELXY": 5.0}, None),  # optical flow
         (
             "measured",
             {"EK3_SRC1_POSXY": 0.0, "EK3_SRC2_POSZ": 6.0, "EK3_SRC3_POSXY": 0.0, "EK3_SRC3_VELXY": 0.0},
             None,  # set 1 has none either
         ),
-        ("measured", {"EK3_SRC3_YAW": 0.0}, "the third position of the switch"),
+        ("measured", {"EK3_SRC3_YAW": 0.0}, "the pilot's switch can select it"),
+        ("none", {"EK3_SRC3_POSXY": 6.0}, "grd's poses belong in its own set"),
+        ("none", {"EK3_SRC3_VELXY": 6.0}, "grd's poses belong in its own set"),
     ],
 )
 def test_a_parameter_may_depend_on_another(yaw: YawOutput, changes: dict[str, float], why: str | None):

@@ -322,6 +322,74 @@ def test_set_1_is_not_requested_while_its_gps_is_unusable(gps: tuple[int, int]):
     assert flight.fly(1).requested == [2, 1]
 
 
+def test_a_bad_gps_is_better_than_no_position_at_all():
+    flight = Flight().fly(10)
+    flight.poses, flight.gps = False, (3, 8000)
+    assert flight.fly(3.9).requested == [2]
+    assert flight.fly(1).requested == [2, 1]
+
+
+def test_an_old_report_of_the_gps_counts_no_more():
+    flight = Flight().fly(10)
+    flight.gps = (1, 0)
+    flight.fly(1)
+    flight.gps, flight.poses = None, False
+    assert flight.fly(1).requested == [2]
+    assert flight.fly(2).requested == [2, 1]
+
+
+@pytest.mark.parametrize("lost", [1, 3])
+def test_set_1_is_requested_also_after_a_request_of_grds_set_whose_acknowledgement_was_lost(lost: int):
+    flight = Flight()
+    flight.results = [None] * lost
+    while len(flight.requested) < lost:
+        flight.fly(0.1)
+    flight.fly(0.0 if lost == 1 else 2.0)
+    assert flight.switch.uses_grd is None
+    flight.poses = False
+    flight.fly(3)
+    assert flight.requested == [2] * lost + [1]
+    assert flight.switch.active == 1
+
+
+def test_a_late_acknowledgement_or_one_of_another_station_makes_the_set_unknown():
+    flight = Flight().fly(2)
+    flight.say("Using EKF Source Set 1")
+    foreign = mavlink.MAVLink_command_ack_message(SET_EKF_SOURCE_SET, ACCEPTED, 0, 0, 255, 190)
+    flight.switch.on_message(foreign, flight.now_ns)
+    assert flight.switch.uses_grd is None
+    flight.say("Using EKF Source Set 1")
+    flight.switch.on_message(mavlink.MAVLink_command_ack_message(SET_EKF_SOURCE_SET, ACCEPTED), flight.now_ns)
+    assert flight.switch.uses_grd is None
+
+
+def test_after_a_silence_only_grds_set_is_still_known():
+    """A selection may have been missed. That of grd's set is kept, so that its end is answered with set 1."""
+    flight = Flight()
+    for number, uses_grd in ((1, None), (2, True)):
+        flight.say(f"Using EKF Source Set {number}")
+        flight.switch.on_silence()
+        assert flight.switch.uses_grd is uses_grd
+
+
+def test_a_selection_of_set_1_in_flight_is_one_of_the_pilot_also_after_a_restart_of_grd():
+    flight = Flight().fly(3)
+    flight.say("Using EKF Source Set 1")
+    assert flight.fly(20).requested == []
+    assert "the pilot selected set 1" in str(flight.switch.status)
+
+
+def test_the_only_set_is_that_of_grd():
+    assert SourceSwitch(1, False, REQUIRED, (1, 1), (1, 197), print, SIGMA_M).uses_grd is True
+
+
+def test_a_ratio_of_the_compass_that_prevents_the_switch_is_named():
+    flight = Flight()
+    flight.compass_ratio = 0.9
+    flight.fly(20)
+    assert "the EKF's test ratio of the compass is 0.9" in str(flight.switch.status)
+
+
 @pytest.mark.parametrize("gps", [None, (3, 0)], ids=["not sent", "accuracy not reported"])
 def test_set_1_is_requested_where_nothing_is_known_of_its_gps(gps: tuple[int, int] | None):
     flight = Flight()

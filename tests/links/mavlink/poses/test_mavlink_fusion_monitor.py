@@ -121,7 +121,28 @@ def test_the_ratio_that_the_compass_had_at_the_switch_is_not_that_of_the_yaw():
     assert flight.fly(1.0, 1.3, report_of_yaw) == 50
     flight.uses_grd = True
     assert flight.fly(3.0, 1.3, report_of_yaw) == 150  # kept since then
-    assert flight.fly(2.0, 1.5, report_of_yaw) < 50
+    flight.fly(1.0, 1.7, report_of_yaw)
+    assert flight.fly(2.0, 1.5, report_of_yaw) < 50  # of a yaw whose ratio falls
+
+
+def test_a_glitch_interrupts_the_time_of_small_ratios():
+    flight = Flight()
+    assert flight.fly(2.0, 1.4) < 50
+    assert flight.fly(1.4, 0.3) == 0
+    assert flight.fly(1.6, 2.0, ardupilot_gps_glitch) == 0
+    assert flight.fly(1.4, 0.3) == 0
+
+
+def test_stopped_is_sent_three_times_also_when_poses_come_back_for_a_moment():
+    sender = PoseSender(("odometry",), PoseLimits(), yaw="measured")
+    texts: list[str] = []
+    for step in range(1000):
+        now_ns = HOST0 + step * 20 * MS
+        pose = good_pose(now_ns)
+        if step < 300 or 320 <= step < 335:
+            sender.on_sent(pose, now_ns, sender.messages(pose, now_ns))
+        texts += [m.text for m in sender.due_texts(now_ns)]
+    assert texts.count("grd: STOPPED: no poses sent") == 3
 
 
 def test_a_rejected_compass_is_not_that_of_a_position_without_yaw():

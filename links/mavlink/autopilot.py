@@ -56,6 +56,8 @@ class AutopilotSettings(SourceSettings):
     sender: IPv4Address | None = None  # the autopilot's address, required when udpin listens beyond loopback
     profile: ProfileName = "ardupilot"
     send: tuple[PoseMessage, ...] = ("odometry",)  # messages per pose
+    # None: every pose, 50 a second; 20 send every third. ArduPilot needs 4 Hz; PX4 starts with 200 ms between two
+    max_pose_hz: float | None = Field(None, ge=10, le=50)
     yaw: YawOutput = "none"  # none: positions in the autopilot's axes; measured: poses with yaw, EK3_SRCn_YAW 6
     source_set: int = Field(2, ge=1, le=3)  # ArduPilot: EK3_SRCn_* that are grd's; set 1 flies without it
     switch_source: bool = False  # ArduPilot: request that set in flight, and set 1 when poses end (`source_switch.py`)
@@ -204,6 +206,7 @@ class Autopilot(Source[AutopilotSettings]):
                 yaw=settings.yaw,
                 profile=settings.profile,
                 on_rejection=settings.on_rejection,
+                max_pose_hz=settings.max_pose_hz,
             )
         if self._switch is None:
             self._switch = SourceSwitch(

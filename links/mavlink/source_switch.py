@@ -12,10 +12,10 @@ The switch to grd's set is requested (MAV_CMD_SET_EKF_SOURCE_SET) while all of t
     it is slow enough for the angle between both axes, see below
 
 A request that is denied, or that is not acknowledged three times, is not repeated until the autopilot boots. Nor is any
-after somebody else has selected another set: ArduPilot names a set that its remote control selects in a STATUSTEXT. It
-acknowledges our command without a text, and reports nowhere which set is in use: after a boot, or a start of grd, it is
-unknown until a text or an acknowledgement, as after a request of ours until its acknowledgement, after one of another
-station, and after a silence.
+after somebody else has selected another set, or has commanded one from another station, as far as that is seen:
+ArduPilot names a set that its remote control selects in a STATUSTEXT. It acknowledges a command without a text, and
+reports nowhere which set is in use: after a boot, a start of grd, a silence, or a command of another station it is
+unknown until a text or an acknowledgement, and so it is after a request of ours until it is acknowledged.
 
 Set 1 is requested FALLBACK_AFTER_NS after the last pose, once a second until it is acknowledged, if its position is
 from another source than grd, and GPS (its first receiver) has a 3D fix; with one worse than MAX_GPS_SIGMA_M only
@@ -75,7 +75,7 @@ USING = re.compile(r"Using EKF Source Set (\d)")
 
 
 class SourceSwitch:
-    """Knows the source set of one ArduPilot, and requests sets if `enabled`; in one run of grd."""
+    """The source set that one ArduPilot uses, in one run of grd; with `enabled` it also requests sets."""
 
     def __init__(
         self,
@@ -306,6 +306,8 @@ class SourceSwitch:
         if not ours or self._pending is None:
             if result == ACCEPTED:  # of another station, or to a request that was given up
                 self.active, self._may_be_own = None, True
+                if not ours and self._enabled:
+                    self._block("another station chose a set")
             return
         if result in (IN_PROGRESS, TEMPORARILY_REJECTED):
             return

@@ -25,16 +25,13 @@ class RigDrone(StrictModel):
 
 
 class _Camera(StrictModel):
-    """What both cameras have."""
+    """What both cameras have; each also has `pose()`, T_mount_camera."""
 
     lens: Lens
     size_px: int | None = Field(None, ge=1)  # side of the square calibration images; None: not known, or not square
     max_off_axis_deg: float | None = Field(None, gt=0, le=150)  # rays farther off axis are not used; None: lens's limit
     masked_px: tuple[Polygon, ...] = ()  # over the body of the vehicle or drone
     readout_ms: float = Field(0.0, ge=0, le=100)  # from the first row's exposure to the last's: a rolling shutter
-
-    def pose(self) -> Pose:
-        raise NotImplementedError
 
 
 class VehicleCamera(_Camera):

@@ -107,6 +107,7 @@ class FusionMonitor:
     def on_boot(self) -> None:
         """The autopilot has booted."""
         self.stopped, self._resets = False, 0
+        self._uses_grd_ns, self._kept_ratio = None, math.inf
         self._above_ns = self._below_ns = self._newest_ns = self._rejected_ns = None
 
     def _reject(self, ratio: float, of_yaw: bool, now_ns: int) -> tuple[str, bool]:

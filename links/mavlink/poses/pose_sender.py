@@ -17,6 +17,8 @@ pause that the autopilot noticed, so that it resets to the new position instead 
 its yaw then. Its initial value is
 arbitrary: after a restart of grd it should differ from the previous one.
 
+`max_pose_hz` leaves poses out on a slow link; one after a jump is sent at once.
+
 Texts: `status_texts.py`. Rejection of the pose by the autopilot: `fusion_monitor.py`.
 
 Source: ours; ArduPilot AP_VisualOdom (300 ms health), AP_AHRS::attitudes_consistent (20 deg of yaw); PX4 EKF2
@@ -51,6 +53,7 @@ from stages.messages import PoseState, RelativePose
 PoseMessage = Literal["odometry", "vision_position_estimate", "landing_target"]
 
 POSE_TIMEOUT_NS = 300_000_000  # the autopilot's timeout for poses
+STAMP_ERROR_NS = 1_000_000  # ours: poses a period apart by less than this are one period apart
 FIRST_POSITION_AGE_NS = 1_000_000_000  # of the autopilot's position against the first pose: it comes at 4 Hz or more
 
 
@@ -76,6 +79,7 @@ class PoseSender:
         yaw: YawOutput,
         profile: ProfileName = "ardupilot",
         on_rejection: OnRejection = "stop",
+        max_pose_hz: float | None = None,
     ) -> None:
         self.rejected: Counter[RejectReason] = Counter()
         self.frame: SentFrame | None = None
@@ -86,6 +90,7 @@ class PoseSender:
         self._limits = limits
         self._yaw: YawOutput = yaw
         self._profile: ProfileName = profile
+        self._least_apart_ns = 0 if max_pose_hz is None else round(1e9 / max_pose_hz) - STAMP_ERROR_NS
         self._yaw_reset = False  # since the first pose
         self._odom_yaw_rad: float | None = None  # of the newest pose that had one
         self._axes_pose: RelativePose | None = None  # first pose sent without yaw since the estimate last jumped
@@ -141,6 +146,8 @@ class PoseSender:
         else:
             if self._has_jumped(pose, now_ns):
                 self._increment_reset_counter()
+            elif self._sent is not None and pose.stamp_ns - self._sent.stamp_ns < self._least_apart_ns:
+                return []
             self._next_frame = self._frame_of(pose)
         return [self._message(kind, pose) for kind in sendable]
 

@@ -18,16 +18,9 @@ from flow.subprocess_replay import can_use_subprocesses
 from links.cli.app import COMMANDS
 from links.cli.app import command as command_named
 from links.cli.files import read_rig
-from tests import command
 
 ROOT = Path(__file__).resolve().parents[3]
 STREET = ROOT / "recordings" / "street_sweep.mcap"
-
-
-@pytest.fixture
-def grd(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    return command.grd
 
 
 def without_viewer(folder: Path) -> Path:

@@ -11,16 +11,9 @@ from flow.link import LinkError, Record
 from links.cli.console import check_output
 from links.recording import RecordingReader, RecordingWriter
 from links.recording.writer import beside
-from tests import command
 
 ROOT = Path(__file__).resolve().parents[3]
 STREET = ROOT / "recordings" / "street_sweep.mcap"
-
-
-@pytest.fixture
-def grd(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    return command.grd
 
 
 def test_a_file_next_to_a_source_has_its_name(tmp_path, monkeypatch):

@@ -11,7 +11,6 @@ from flow.graph import load_graph
 from links import __version__
 from links.preflight.shipped_values import shipped_values
 from links.runs.shipped import CONFIGS, RECORDINGS, SCENARIOS, shipped, shipped_scenario
-from tests import command
 
 QUIET = """\
 include: field.yaml
@@ -26,12 +25,6 @@ links:
 stages: {ego: null, motion: {inputs: {ego: null}}, vp_vehicle: null, vp_drone: null, drone_odometry: null, align: null,
   fuse: {inputs: {rotation: null, visual_motion: null}}}
 """
-
-
-@pytest.fixture
-def grd(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    return command.grd
 
 
 @pytest.mark.parametrize(

@@ -352,15 +352,21 @@ def test_set_1_is_requested_also_after_a_request_of_grds_set_whose_acknowledgeme
     assert flight.switch.active == 1
 
 
-def test_a_late_acknowledgement_or_one_of_another_station_makes_the_set_unknown():
+def test_a_late_acknowledgement_makes_the_set_unknown():
     flight = Flight().fly(2)
-    flight.say("Using EKF Source Set 1")
+    flight.switch.on_message(mavlink.MAVLink_command_ack_message(SET_EKF_SOURCE_SET, ACCEPTED), flight.now_ns)
+    assert flight.switch.uses_grd is None
+
+
+def test_a_command_of_another_station_is_not_overridden():
+    flight = Flight().fly(10)
     foreign = mavlink.MAVLink_command_ack_message(SET_EKF_SOURCE_SET, ACCEPTED, 0, 0, 255, 190)
     flight.switch.on_message(foreign, flight.now_ns)
     assert flight.switch.uses_grd is None
-    flight.say("Using EKF Source Set 1")
-    flight.switch.on_message(mavlink.MAVLink_command_ack_message(SET_EKF_SOURCE_SET, ACCEPTED), flight.now_ns)
-    assert flight.switch.uses_grd is None
+    assert flight.fly(20).requested == [2]
+    assert flight.texts[-1] == "no source switch: another station chose a set"
+    flight.poses = False
+    assert flight.fly(2).requested == [2, 1]  # it may be grd's that is in use
 
 
 def test_after_a_silence_only_grds_set_is_still_known():

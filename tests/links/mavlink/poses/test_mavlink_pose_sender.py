@@ -401,3 +401,28 @@ def test_a_position_alone_is_a_warning_only_if_poses_with_yaw_are_sent(yaw: YawO
         pose_sender.messages(pose, HOST0 + 20 * i * MS)
     (text,) = pose_sender.due_texts(HOST0 + 1500 * MS)
     assert (text.severity, text.text) == (severity, "grd: POSITION_ONLY: by LiDAR")
+
+
+@pytest.mark.parametrize(("max_pose_hz", "every_ms"), [(None, 20), (50.0, 20), (25.0, 40), (20.0, 60), (10.0, 100)])
+def test_a_lower_rate_of_poses_sends_fewer_but_a_jump_at_once(max_pose_hz: float | None, every_ms: int):
+    sender = PoseSender(("odometry",), PoseLimits(), yaw="measured", max_pose_hz=max_pose_hz)
+    sent_ms: list[int] = []
+    for ms in range(0, 2000, 20):
+        now_ns = HOST0 + ms * MS
+        pose = dataclasses.replace(good_pose(now_ns), resets=int(ms >= 1020))
+        messages = sender.messages(pose, now_ns)
+        if messages:
+            sender.on_sent(pose, now_ns, messages)
+            sent_ms.append(ms)
+    before = [ms for ms in sent_ms if ms < 1020]
+    assert before == list(range(0, 1020, every_ms))
+    assert 1020 in sent_ms
+    assert not sender.rejected
+
+
+def test_a_bad_pose_ends_the_stream_at_once_at_any_rate():
+    sender = PoseSender(("odometry",), PoseLimits(), yaw="measured", max_pose_hz=10.0)
+    sender.on_sent(good_pose(HOST0), HOST0, sender.messages(good_pose(HOST0), HOST0))
+    now_ns = HOST0 + 20 * MS
+    assert sender.messages(dataclasses.replace(good_pose(now_ns), state=PoseState.LOST), now_ns) == []
+    assert not sender.sending

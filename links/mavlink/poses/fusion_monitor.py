@@ -41,7 +41,6 @@ REJECTS_POSITION, REJECTS_YAW = "autopilot rejects the position", "autopilot rej
 MAX_REJECTED_NS = 600_000_000  # ratio above 1 for so long, before ArduPilot's failsafe of 1 s
 RESUME_BELOW, RESUME_AFTER_NS = 0.5, 3_000_000_000  # half the innovation that the gate allows, as preflight warns of
 MAX_RESETS = 3
-KEPT_NS = 1_000_000_000  # after the change to grd's set, at which ArduPilot resets its yaw: the compass's ratio is seen
 RESETS_FORGOTTEN_NS = 5_000_000_000  # without rejection, after which resets are counted again from zero
 GPS_GLITCH = {"EKF_STATUS_REPORT": 1 << 15, "ESTIMATOR_STATUS": 1 << 10}  # EKF_GPS_GLITCHING, ESTIMATOR_GPS_GLITCH
 MAX_STATUS_GAP_NS = 2_000_000_000  # between two status messages: no statement in between
@@ -61,8 +60,7 @@ class FusionMonitor:
         self._below_ns: int | None = None  # since when it is below RESUME_BELOW
         self._newest_ns: int | None = None
         self._rejected_ns: int | None = None
-        self._uses_grd_ns: int | None = None  # since when the autopilot uses grd's set
-        self._kept_ratio = math.inf  # of the compass at that time
+        self._kept_ratio = math.inf  # bound of the ratio that the compass had before the autopilot used grd's set
 
     def add(
         self, message: Any, sending: bool, now_ns: int, uses_grd: bool | None = None, sends_yaw: bool = False
@@ -75,8 +73,8 @@ class FusionMonitor:
             return None
         ratio, of_yaw = _ratio(message) if uses_grd is not False else math.nan, False
         if not uses_grd:
-            self._kept_ratio, self._uses_grd_ns = math.inf, None
-        yaw_ratio = self._yaw_ratio(message, now_ns) if uses_grd and sends_yaw else None
+            self._kept_ratio = math.inf
+        yaw_ratio = self._yaw_ratio(message) if uses_grd and sends_yaw else None
         if yaw_ratio is not None and yaw_ratio > max(1.0, ratio or 0.0):
             ratio, of_yaw = yaw_ratio, True
         if ratio is None or (math.isnan(ratio) and not self.stopped):
@@ -94,20 +92,18 @@ class FusionMonitor:
             return None
         return self._reject(ratio, of_yaw, now_ns)
 
-    def _yaw_ratio(self, message: Any, now_ns: int) -> float | None:
+    def _yaw_ratio(self, message: Any) -> float | None:
         """Test ratio of the yaw if it is above that of the compass at the switch to grd's set; None: not known."""
         if message.get_type() != "EKF_STATUS_REPORT":
             return None
         ratio = float(message.compass_variance)
-        self._uses_grd_ns = self._uses_grd_ns or now_ns
-        if now_ns - self._uses_grd_ns < KEPT_NS:
-            self._kept_ratio = min(self._kept_ratio, ratio)
+        self._kept_ratio = min(self._kept_ratio, ratio)
         return ratio if ratio > self._kept_ratio else None
 
     def on_boot(self) -> None:
         """The autopilot has booted."""
         self.stopped, self._resets = False, 0
-        self._uses_grd_ns, self._kept_ratio = None, math.inf
+        self._kept_ratio = math.inf
         self._above_ns = self._below_ns = self._newest_ns = self._rejected_ns = None
 
     def _reject(self, ratio: float, of_yaw: bool, now_ns: int) -> tuple[str, bool]:

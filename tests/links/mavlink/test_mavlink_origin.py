@@ -57,6 +57,13 @@ def test_the_origin_is_sent_after_three_replies_without_an_origin_and_again_unti
     assert [m.get_type() for m in run(sender, 1, ack(result))] == ["COMMAND_LONG"]
 
 
+def test_an_acknowledgement_that_names_another_requester_is_not_ours():
+    sender = OriginSender(ORIGIN, (1, 1), (1, 197))
+    foreign = mavlink.MAVLink_command_ack_message(512, 3, 0, 0, 255, 190)  # unsupported
+    assert {m.get_type() for m in run(sender, 8, foreign)} == {"COMMAND_LONG"}
+    assert sender.state is OriginState.REQUESTING
+
+
 def test_an_autopilot_keeps_its_origin():
     sender = OriginSender(ORIGIN, (1, 1), (1, 197))
     sent = run(sender, 30, ack(0), mavlink.MAVLink_gps_global_origin_message(1, 2, 3))

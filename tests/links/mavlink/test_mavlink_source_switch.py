@@ -341,6 +341,7 @@ def test_an_old_report_of_the_gps_counts_no_more():
 @pytest.mark.parametrize("lost", [1, 3])
 def test_set_1_is_requested_also_after_a_request_of_grds_set_whose_acknowledgement_was_lost(lost: int):
     flight = Flight()
+    flight.say("Using EKF Source Set 1")
     flight.results = [None] * lost
     while len(flight.requested) < lost:
         flight.fly(0.1)

@@ -223,3 +223,45 @@ def test_landing_target_alone_is_no_sending_of_poses():
     sender.autopilot.attitude = AutopilotAttitude(0.0, 0.0, 0.0, again.stamp_ns)
     assert {message.get_type() for message in sender.messages(again, again.stamp_ns)} == {"ODOMETRY", "LANDING_TARGET"}
     assert sender.reset_counter == (counter + 1) % 256
+
+
+class LinkFlight:
+    """A session with yaw: a pose every 20 ms, and with each tenth an EKF status with this ratio of the position."""
+
+    def __init__(self, **settings: Any) -> None:
+        self.now_ns = HOST0
+        self.link = Autopilot(yaw="measured", **settings)
+        self.session = self.link.open_session(VirtualConnection(), lambda: self.now_ns, threaded=False)
+        self._mav = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+
+    def give(self, message: Any) -> None:
+        list(self.session.receive(packed(message, self._mav), PEER, self.now_ns))
+
+    def fly(self, seconds: float, ratio: float) -> LinkFlight:
+        for step in range(round(50 * seconds)):
+            self.now_ns += 20 * MS
+            if step % 10 == 0:
+                self.give(attitude((self.now_ns - HOST0) // MS + 1000, 60.0))
+                self.give(mavlink.MAVLink_ekf_status_report_message(0, 0.1, ratio, 0.1, 0.1, 0.0))
+            self.session.send_pose(good_pose(self.now_ns))
+            self.session.tick()
+        return self
+
+
+@pytest.mark.parametrize(
+    ("text", "silence_s", "stopped"), [("Set 1", 0, False), ("Set 1", 4, True), ("Set 2", 0, True)]
+)
+def test_a_ratio_counts_unless_the_autopilot_is_known_to_use_another_set(text: str, silence_s: int, stopped: bool):
+    flight = LinkFlight().fly(1.0, 0.1)
+    flight.give(mavlink.MAVLink_statustext_message(6, f"Using EKF Source {text}".encode()))
+    flight.now_ns += silence_s * 1000 * MS
+    assert flight.fly(2.0, 1.4).session.poses.fusion.stopped is stopped
+
+
+@pytest.mark.parametrize("switch_source", [True, False])
+def test_the_state_of_the_gps_is_requested_only_to_switch_source_sets(switch_source: bool):
+    flight = LinkFlight(switch_source=switch_source)
+    flight.fly(12.0, 0.1)
+    frames = [parse_frame(record.data) for record in flight.session.sent()]
+    asked = {round(frame.param1) for frame in frames if frame.get_type() == "COMMAND_LONG" and frame.command == 511}
+    assert (24 in asked) is switch_source

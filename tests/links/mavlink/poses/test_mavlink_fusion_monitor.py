@@ -121,8 +121,7 @@ def test_the_ratio_that_the_compass_had_at_the_switch_is_not_that_of_the_yaw():
     assert flight.fly(1.0, 1.3, report_of_yaw) == 50
     flight.uses_grd = True
     assert flight.fly(3.0, 1.3, report_of_yaw) == 150  # kept since then
-    flight.fly(1.0, 1.7, report_of_yaw)
-    assert flight.fly(2.0, 1.5, report_of_yaw) < 50  # of a yaw whose ratio falls
+    assert flight.fly(2.0, 1.5, report_of_yaw) < 50
 
 
 def test_a_glitch_interrupts_the_time_of_small_ratios():

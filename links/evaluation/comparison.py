@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 import re
+import statistics
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -180,7 +181,7 @@ def common_rmse_m(pairs: list[Pair]) -> tuple[float, float] | None:
     both = [errors for pair in pairs if (errors := pair.common_rmse_m()) is not None]
     if not both:
         return None
-    own, other = (sorted(side)[len(both) // 2] for side in zip(*both, strict=True))
+    own, other = (statistics.median(side) for side in zip(*both, strict=True))
     return own, other
 
 

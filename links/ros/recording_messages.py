@@ -10,6 +10,7 @@ Source: ROS 2 common_interfaces; REP-103, REP-105; `links/ros/autopilot.py` for 
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Iterator
 from typing import Any
 
@@ -24,6 +25,7 @@ from links.recording import decode_compressed_image
 from links.recording.format import TRUTH_POSES
 from links.ros.mapping import MAVLINK, POINTS, POSE
 from links.ros.message_types import header, stamp
+from links.runs.truth import INVALID, true_pose
 from stages.geometry.frames import Array64, Pose, quaternions_xyzw, rotation_from_quaternion_xyzw, rotation_z
 from stages.messages import LidarFirings
 
@@ -71,13 +73,22 @@ class RecordingMessages:
         self._packets: list[Record] = []
         self._firings: list[LidarFirings] = []
         self._static_sent = False
-        self._left_out: dict[str, int] = {}
+        self._left_out: Counter[str] = Counter()
+        self._invalid: Counter[str] = Counter()
 
     def of(self, record: Record) -> Iterator[Entry]:
-        """The messages of a record; packets are collected."""
+        """The messages of a record; packets are collected, records that are no valid JSON of their topic counted."""
         if not self._static_sent:
             self._static_sent = True
             yield from self._static(record.arrival_ns)
+        try:
+            entries = list(self._entries(record))
+        except INVALID:
+            self._invalid[record.topic] += 1
+            return
+        yield from entries
+
+    def _entries(self, record: Record) -> Iterator[Entry]:
         topic = record.topic
         if topic == "/lidar/packets":
             if self._lidar is None:
@@ -97,14 +108,10 @@ class RecordingMessages:
             name = "/mavlink/from" if topic.endswith("rx") else "/mavlink/to"
             yield name, MAVLINK, record.arrival_ns, _mavlink(record)
         elif topic in TRUTH_POSES:
-            pose = json.loads(record.data)
-            values = {
-                "header": header(record.stamp_ns, "world"),
-                "pose": pose_values(pose["xyz_m"], pose["quaternion_xyzw"]),
-            }
+            values = {"header": header(record.stamp_ns, "world"), "pose": pose_values(*true_pose(record.data))}
             yield topic, "geometry_msgs/msg/PoseStamped", record.arrival_ns, values
         else:
-            self._left_out[topic] = self._left_out.get(topic, 0) + 1
+            self._left_out[topic] += 1
 
     def end(self) -> Iterator[Entry]:
         """The collected packets and their points."""
@@ -119,8 +126,9 @@ class RecordingMessages:
         self._packets, self._firings = [], []
 
     def warnings(self) -> list[str]:
-        """Topics that were left out."""
-        return [f"{n} records on {topic} are left out: no message holds them" for topic, n in self._left_out.items()]
+        """Topics with records that were left out."""
+        unknown = [f"{n} records on {topic} are left out: no message holds them" for topic, n in self._left_out.items()]
+        return unknown + [f"{n} records on {topic} are left out: invalid" for topic, n in self._invalid.items()]
 
     def _static(self, time_ns: int) -> Iterator[Entry]:
         """The transforms of the rig that do not change."""

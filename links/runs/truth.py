@@ -77,11 +77,11 @@ class TruthLog:
     def _store(self, match: re.Match[str] | None, record: Record) -> None:
         """Store a record of the vehicle, or of the drone in its topic. Raises one of INVALID."""
         if match is None:
-            self.vehicle[record.stamp_ns] = _pose(record.data)
+            self.vehicle[record.stamp_ns] = true_pose(record.data)
             return
         drone = self.drones.setdefault(int(match[2] or 1), TrueDrone())
         if match[1] == "drone":
-            drone.pose[record.stamp_ns] = _pose(record.data)
+            drone.pose[record.stamp_ns] = true_pose(record.data)
         elif match[1] == "hits":
             pulses = _pulses(record.data)
             drone.return_ns = drone.return_ns or []
@@ -191,7 +191,8 @@ def _visible(data: bytes) -> bool:
     return visible
 
 
-def _pose(data: bytes) -> tuple[tuple[float, float, float], Quaternion]:
+def true_pose(data: bytes) -> tuple[tuple[float, float, float], Quaternion]:
+    """Position [m] and rotation of a record of truth. Raises one of INVALID."""
     fields = json.loads(data)
     x, y, z = (float(v) for v in fields["xyz_m"])
     qx, qy, qz, qw = (float(v) for v in fields["quaternion_xyzw"])

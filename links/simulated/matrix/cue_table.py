@@ -18,6 +18,7 @@ from __future__ import annotations
 import itertools
 import math
 import re
+import statistics
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -187,13 +188,12 @@ def table_of(rows: Sequence[dict[str, Any]]) -> str:
         of = [row for row in rows if range_of(row["cell"]) == range_m and row["variant"] == variant]
         if not of:
             continue
-        first_s = sorted(row["first_fix_s"] if row["first_fix_s"] is not None else math.inf for row in of)
+        first_s = [row["first_fix_s"] if row["first_fix_s"] is not None else math.inf for row in of]
         false = list(itertools.chain.from_iterable(row["false"] for row in of))
         by = sum(one["by_cues"] for one in false)
         found = sum(map(math.isfinite, first_s))
         reported = sum(row["reported_s"] is not None for row in of)
-        median_s, slowest_s = first_s[(len(first_s) - 1) // 2], first_s[-1]
-        times = f"{found} | {median_s:.2f} | {slowest_s:.2f}"
+        times = f"{found} | {statistics.median(first_s):.2f} | {max(first_s):.2f}"
         lines.append(f"| {range_m} m | {variant} | {len(of)} | {times} | {len(false)} ({by}) | {reported} |")
     exposed = [row["exposed"] for row in rows if row["variant"] == "none"]
     lines.append(

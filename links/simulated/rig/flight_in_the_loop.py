@@ -11,7 +11,7 @@ from flow.graph import Graph
 from flow.link import TRUTH_TOPICS, LinkError, Record
 from links.simulated.autopilot.flight_stack.outcomes.outcome import FlightOutcome, Outcome
 from links.simulated.autopilot.flight_stack.stack import FlightStack
-from links.simulated.pose_sensors.pose_source import SimulatedFixes
+from links.simulated.pose_sensors.pose_source import SimulatedFixes, SimulatedRotations
 from links.simulated.rig.closed_loop import ClosedLoop
 from links.simulated.rig.pose_loop import has_autopilot, pose_edge
 from links.simulated.rig.scenario import Scenario
@@ -21,22 +21,28 @@ from links.simulated.world.mesh import RayScene
 from links.simulated.world.scene import Truth
 
 OUTCOME_TOPIC = f"{TRUTH_TOPICS}/flight"
+SENSORS = (  # of a scenario: name, link that reads it, what it replaces, a configuration with and without it
+    ("fix_sensor", SimulatedFixes, "a LiDAR", "sim_flight_fixes.yaml", "sim_flight.yaml"),
+    ("rotation_sensor", SimulatedRotations, "cameras", "sim_flight_rotations_fixes.yaml", "sim_flight_yaw_fixes.yaml"),
+)
 ABOVE_M = 50.0  # over the place of a take-off, must be free
 
 
 def check_loop(graph: Graph, scenario: Scenario) -> None:
     """Raise LinkError for a graph that lacks what a scenario in closed loop needs, or reads what it does not have."""
-    reads_fixes = any(issubclass(spec.cls, SimulatedFixes) for spec in graph.nodes.values())
-    if reads_fixes and scenario.fix_sensor is None:
-        raise LinkError(
-            f"the scenario {scenario.name} has no fix_sensor, and the configuration takes its fixes: use a "
-            "configuration with a LiDAR, as configs/sim_flight.yaml, or set fix_sensor={} of the scenario"
-        )
-    if scenario.fix_sensor is not None and not reads_fixes:
-        raise LinkError(
-            f"the scenario {scenario.name} has a fix_sensor instead of a LiDAR, and the configuration does not take "
-            "its fixes: use configs/sim_flight_fixes.yaml, or one that includes it"
-        )
+    for name, link, replaced, with_it, without in SENSORS:
+        has = getattr(scenario, name) is not None
+        reads = any(issubclass(spec.cls, link) for spec in graph.nodes.values())
+        if reads and not has:
+            raise LinkError(
+                f"the scenario {scenario.name} has no {name}, which the configuration reads: use one that does not, as "
+                f"configs/{without}, or set {name}={{}} of the scenario"
+            )
+        if has and not reads:
+            raise LinkError(
+                f"the scenario {scenario.name} has a {name} in place of {replaced}, which the configuration does not "
+                f"read: use configs/{with_it}, or one that includes it"
+            )
     stack = None if scenario.autopilot is None else scenario.autopilot.flight_stack
     if stack is not None and graph.left_out:
         raise LinkError(

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from flow.link import LinkError
-from links.evaluation.comparison import pair_up
+from links.evaluation.comparison import common_rmse_m, pair_up
 from links.evaluation.figures import MAX_POINTS, worst_of_each
 from links.evaluation.tables import medians, ranks
 from tests.command import grd
@@ -70,6 +70,16 @@ def test_two_runs_are_compared_in_the_time_both_have_an_output(tmp_path):
     both = pair_up([a], [b])[0][0].common_rmse_m()
     assert both is not None
     assert both[0] > 0.5 > both[1]
+
+
+def test_the_errors_of_an_even_number_of_pairs_are_the_mean_of_the_middle_two(tmp_path):
+    pairs = [
+        pair_up([evaluated(fly(tmp_path / f"own{k}", off_m))], [evaluated(fly(tmp_path / f"other{k}", 0.1))])[0][0]
+        for k, off_m in enumerate((0.2, 0.4))
+    ]
+    each = [errors for pair in pairs if (errors := pair.common_rmse_m()) is not None]
+    assert common_rmse_m(pairs) == pytest.approx(np.mean(each, axis=0))
+    assert each[0][0] < 0.9 * each[1][0]
 
 
 def test_the_json_file_has_numbers_or_reasons_but_never_nan(tmp_path):

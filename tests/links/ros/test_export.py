@@ -306,3 +306,19 @@ def test_a_record_without_a_message_is_counted():
     for _ in range(2):
         list(messages.of(Record("/cues", 1, 1, b"{}")))
     assert messages.warnings() == ["2 records on /cues are left out: no message holds them"]
+
+
+@pytest.mark.parametrize(
+    ("topic", "data"),
+    [
+        ("/truth/drone", b"not JSON"),
+        ("/truth/drone", b'{"xyz_m": [0, 0, NaN], "quaternion_xyzw": [0, 0, 0, 1]}'),
+        ("/truth/vehicle", b'{"xyz_m": [0, 0, 0], "quaternion_xyzw": [0, 0, 0, 2]}'),
+        ("/servo/state", b'{"position_rad": 0.1}'),
+        ("/vehicle/odometry", b'{"xyz_m": [0, 0, 0], "quaternion_xyzw": [0, 0, 0, 1], "covariance": [1]}'),
+    ],
+)
+def test_an_invalid_record_is_left_out_and_counted(topic: str, data: bytes):
+    messages = RecordingMessages(None, "a.mcap")
+    assert list(messages.of(Record(topic, 1, 1, data))) == []
+    assert messages.warnings() == [f"1 records on {topic} are left out: invalid"]

@@ -58,11 +58,13 @@ def test_a_wrong_setting_is_an_error_before_the_first_flight(tmp_path: Path) -> 
         (
             "hover_fixes",
             "estimate",
-            "has a fix_sensor instead of a LiDAR, and the configuration does not take its fixes",
+            "has a fix_sensor in place of a LiDAR, which the configuration does not read: use configs/sim_flight_fixes",
         ),
-        ("hover_fixes", "sim_flight", "has a fix_sensor instead of a LiDAR"),
+        ("hover_fixes", "sim_flight", "has a fix_sensor in place of a LiDAR"),
         ("hover_fixes", "sim_flight_cameras_fixes", r"lacks what the configuration needs: .* no \$rig\.cameras"),
-        ("hover", "sim_flight_fixes", "has no fix_sensor, and the configuration takes its fixes"),
+        ("hover", "sim_flight_fixes", "has no fix_sensor, which the configuration reads: use .* or set fix_sensor={}"),
+        ("matrix/hover", "sim_flight_rotations_fixes", r"has no rotation_sensor, .* or set rotation_sensor={} of"),
+        ("matrix/hover_rotations", "sim_flight_fixes", "has a rotation_sensor in place of cameras, which"),
         (
             "hover",
             "sim",

@@ -61,10 +61,11 @@ def test_the_table_of_cues_counts_found_flights_and_false_acceptances():
         found | {"variant": "none", "seed": 1, "first_fix_s": 2.0, "reported_s": None, "false": []},
         found | {"variant": "none", "seed": 2, "first_fix_s": None, "reported_s": None, "false": [{"by_cues": False}]},
         found | {"variant": "gnss", "seed": 1, "first_fix_s": 1.0, "reported_s": 3.0, "false": [{"by_cues": True}]},
+        found | {"variant": "gnss", "seed": 2, "first_fix_s": 2.0, "reported_s": 3.0, "false": []},
     ]
     table = cue_table.table_of(rows)
-    assert "| 20 m | none | 2 | 1 | 2.00 | inf | 1 (0) | 0 |" in table
-    assert "| 20 m | gnss | 1 | 1 | 1.00 | 1.00 | 1 (1) | 1 |" in table
+    assert "| 20 m | none | 2 | 1 | inf | inf | 1 (0) | 0 |" in table
+    assert "| 20 m | gnss | 2 | 2 | 1.50 | 2.00 | 1 (1) | 2 |" in table
 
 
 def test_the_table_of_lidars_has_the_errors_of_all_flights_of_a_model():

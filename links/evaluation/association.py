@@ -135,6 +135,22 @@ def interpolate(at_ns: Stamps, stamps_ns: Stamps, xyz_m: Array64, max_gap_ns: in
     return b.known, (1 - w) * xyz_m[b.before] + w * xyz_m[b.after]
 
 
+def drone_labels(
+    stamps_ns: Stamps, xyz_m: Array64, paths: Sequence[tuple[Stamps, Array64]], limits: EvaluationLimits
+) -> tuple[Flags, Flags]:
+    """Positions (n, 3) [m] of which it is known whether they are of a drone, and those that are: flags (n,) each.
+
+    Of a drone: within `false_m` of one then. `paths`: true stamps [ns] and positions [m] of all drones, maybe none. Not
+    known: the truth of a drone has a gap there, and no other is near.
+    """
+    everywhere, is_drone = np.ones(len(stamps_ns), dtype=np.bool_), np.zeros(len(stamps_ns), dtype=np.bool_)
+    for path in paths:
+        covered, at_m = interpolate(stamps_ns, *path, limits.max_gap_ns)
+        everywhere &= covered
+        is_drone |= covered & (np.linalg.norm(xyz_m - at_m, axis=1) < limits.false_m)
+    return everywhere | is_drone, is_drone
+
+
 def newest(at_ns: Stamps, stamps_ns: Stamps) -> NDArray[np.int64]:
     """Index of the newest sample at or before each time; -1 before the first."""
     return np.searchsorted(stamps_ns, at_ns, side="right") - 1

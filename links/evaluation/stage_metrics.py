@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
-from links.evaluation.association import EvaluationInput
+from links.evaluation.association import EvaluationInput, drone_labels
 from links.evaluation.errors import EULER, GRID_NS, p95, path_length_m, position_at, rms, rotation_errors
 from links.evaluation.evaluation import (
     NO_SPAN,
@@ -123,14 +123,12 @@ def candidate_outcomes(e: Evaluation) -> pd.DataFrame:
     if rows is None or (run.truth is None and not run.no_drone):
         columns = ("candidate", "probability", "telemetry", "range_m", "is_drone")
         return pd.DataFrame({name: [] for name in columns})
-    known, is_drone = np.ones(len(rows), dtype=np.bool_), np.zeros(len(rows), dtype=np.bool_)
-    for path in [d.path for d in run.drones if d.path is not None and not run.no_drone]:
-        covered, xyz_m = position_at(path, rows.stamp_ns.to_numpy(), e.limits)
-        known &= covered
-        is_drone |= covered & (np.linalg.norm(rows[[*XYZ]] - xyz_m, axis=1) < e.limits.false_m)
+    drones = [] if run.no_drone else [drone.path for drone in run.drones if drone.path is not None]
+    paths = [(path.stamps_ns, path.xyz_m) for path in drones]
+    known, is_drone = drone_labels(rows.stamp_ns.to_numpy(), rows[[*XYZ]].to_numpy(), paths, e.limits)
     range_m = np.linalg.norm(rows[[*XYZ]], axis=1)
     columns = {"candidate": rows.candidate, "probability": rows.probability, "telemetry": rows.telemetry}
-    counted = np.nonzero(known | is_drone)[0]
+    counted = np.nonzero(known)[0]
     return pd.DataFrame(columns | {"range_m": range_m, "is_drone": is_drone}).take(counted)
 
 

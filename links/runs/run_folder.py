@@ -35,6 +35,7 @@ from flow.taps import Digest
 from links.lidar import Lidar, recorded_lidars
 from links.mavlink.autopilot import Autopilot
 from links.recording import Progress, Session
+from links.runs.candidate_labels import label_candidates
 from links.runs.fused_poses import read_fused_poses
 from links.runs.request import RunRequest, RunResult
 from links.runs.result_file import ResultFile
@@ -157,6 +158,8 @@ class RunFolder:
         """The result of one drone with its errors; writes the truth and the summary into its folder."""
         folder, results = result.out_dir, result.results
         truth.write(folder)
+        if why := label_candidates(folder, truth):
+            result.warnings.append(why)
         errors, poses = truth.fix_errors_of(results.fixes), read_fused_poses(folder, truth)
         result = replace(result, errors=errors, poses=poses)
         text = json.dumps(summary(result, self._request), indent=2, allow_nan=False)

@@ -91,6 +91,12 @@ class TruthLog:
             drone.visible = drone.visible or {}
             drone.visible[record.stamp_ns] = visible
 
+    @property
+    def no_drone(self) -> bool:
+        """Whether the truth states that there is no drone: poses of the vehicle, none of a drone, and none invalid."""
+        any_drone = any(drone.pose for drone in self.drones.values()) or any(map(DRONE_TOPIC.fullmatch, self.invalid))
+        return bool(self.vehicle) and not any_drone
+
     def warnings(self) -> list[str]:
         """Topics with invalid records, and how many were left out."""
         return [f"{count} records on {topic} are invalid: left out" for topic, count in self.invalid.items()]
@@ -149,7 +155,7 @@ class TruthLog:
             lines = [tum_line(stamp, np.asarray(t), q) for stamp, (t, q) in sorted(self.vehicle.items())]
             header = f"# T_world_vehicle, {FULL_POSE}, truth\n"
             (folder / TRUTH_VEHICLE_FILE).write_text(header + "".join(lines), encoding="utf-8")
-        elif self.vehicle and not any(map(DRONE_TOPIC.fullmatch, self.invalid)):
+        elif self.no_drone:
             (folder / TRUTH_FILE).write_text(f"# {NO_DRONE} in this recording\n", encoding="utf-8")
 
     def _write_drone(self, folder: Path, number: int, drone: TrueDrone) -> None:

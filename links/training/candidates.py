@@ -22,7 +22,7 @@ from pydantic import ValidationError
 from flow.config.yaml_text import YamlTextError, yaml_values
 from flow.jobs import Workers, run_all
 from flow.link import LinkError
-from links.evaluation.association import EvaluationLimits, interpolate, read_true_drones
+from links.evaluation.association import EvaluationLimits, drone_labels, read_true_drones
 from links.evaluation.text_files import Flags
 from links.runs import results
 from links.runs.run_folder import CONFIG_FILE
@@ -154,14 +154,8 @@ def _recording(folder: Path) -> tuple[str, int]:
 
 def _labels(folder: Path, frame: pd.DataFrame) -> tuple[Flags, Flags]:
     """Rows with truth, and those within `false_m` of a drone."""
-    limits, (drones, empty_sky) = EvaluationLimits(), read_true_drones(folder, None)
-    known = np.full(len(frame), empty_sky)
-    is_drone = np.zeros(len(frame), dtype=np.bool_)
+    drones, empty_sky = read_true_drones(folder, None)
     if not empty_sky and drones[0].path is None:
         raise LinkError(f"{folder}: {next(iter(drones[0].missing.values()))}: nothing to train on")
-    for path in [] if empty_sky else [drone.path for drone in drones if drone.path is not None]:
-        covered, at_m = interpolate(frame.stamp_ns.to_numpy(), path.stamps_ns, path.xyz_m, limits.max_gap_ns)
-        known |= covered
-        distance = np.linalg.norm(frame[["x_m", "y_m", "z_m"]].to_numpy() - at_m, axis=1)
-        is_drone |= covered & (distance < limits.false_m)
-    return known, is_drone
+    paths = [] if empty_sky else [(drone.path.stamps_ns, drone.path.xyz_m) for drone in drones if drone.path]
+    return drone_labels(frame.stamp_ns.to_numpy(), frame[["x_m", "y_m", "z_m"]].to_numpy(), paths, EvaluationLimits())

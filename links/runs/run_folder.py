@@ -35,13 +35,12 @@ from flow.taps import Digest
 from links.lidar import Lidar, recorded_lidars
 from links.mavlink.autopilot import Autopilot
 from links.recording import Progress, Session
-from links.runs.candidate_labels import label_candidates
 from links.runs.fused_poses import read_fused_poses
 from links.runs.request import RunRequest, RunResult
 from links.runs.result_file import ResultFile
 from links.runs.results import SUMMARY_FILE, Results
 from links.runs.summary import summary
-from links.runs.truth import TruthLog, read_truth_file
+from links.runs.truth import TruthLog, label_candidates, read_truth_file
 from links.runs.usage import Usage
 from stages.messages import Detections, DroneFix, RelativePose
 

@@ -1,10 +1,13 @@
-"""Truth of a simulated recording, for the evaluation of a run. It reaches no stage.
+"""Truth of a simulated recording, for the evaluation of a run, and the label of each candidate. It reaches no stage.
+
+`candidates.csv` gets a column `is_drone` when the run has ended: 1 or 0, empty at times without truth.
 
 Source: ours; recording format in recordings/README.md (/truth/*).
 """
 
 from __future__ import annotations
 
+import csv
 import json
 import math
 import re
@@ -17,12 +20,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flow.link import Record
-from links.evaluation.association import follow, interpolate
-from links.evaluation.text_files import FULL_POSE, NO_DRONE
+from flow.link import LinkError, Record
+from links.evaluation.association import EvaluationLimits, drone_labels, follow, interpolate
+from links.evaluation.text_files import FULL_POSE, NO_DRONE, read_stamp_ns
 from links.recording import RecordingReader
 from links.recording.format import MAX_TIME_NS
 from links.runs.results import (
+    CANDIDATES_FILE,
     TRUTH_FILE,
     TRUTH_RETURNS_FILE,
     TRUTH_VEHICLE_FILE,
@@ -42,6 +46,7 @@ Quaternion = tuple[float, float, float, float]  # x, y, z, w
 INVALID = (ValueError, TypeError, KeyError, OverflowError, RecursionError)  # of a record that is no truth
 MAX_M = 1e7
 NORM_TOLERANCE = 1e-3  # of a quaternion
+LABEL, USED = "is_drone", ("stamp_s", "x_m", "y_m", "z_m")  # of the candidate log
 CHI2_95_3 = 7.814728  # 95 % quantile of chi-square with 3 degrees of freedom
 
 
@@ -253,3 +258,34 @@ def fix_errors(
     error_m = np.array([fix.xyz_vehicle_m for fix in evaluated]).reshape(-1, 3) - true_m[known]
     nees = [float(e @ np.linalg.solve(fix.covariance_m2, e)) for e, fix in zip(error_m, evaluated, strict=True)]
     return FixErrors(at_ns[known], error_m, np.array(nees), len(fixes) - len(evaluated))
+
+
+def label_candidates(folder: Path, truth: TruthLog) -> str:
+    """Add the column to the candidate log of a run with truth. Returns why it was not possible, or an empty text."""
+    file = folder / CANDIDATES_FILE
+    paths = [truth.drone_in_vehicle(number) for number, drone in sorted(truth.drones.items()) if drone.pose]
+    if not file.exists() or not (paths or truth.no_drone):
+        return ""
+    labelled = file.with_suffix(".labelled")
+    try:
+        rows = list(_used(file))
+        stamps_ns, xyz_m = np.array([row[0] for row in rows], dtype=np.int64), np.array([row[1:] for row in rows])
+        known, is_drone = drone_labels(stamps_ns, xyz_m.reshape(-1, 3), paths, EvaluationLimits())
+        labels = [LABEL, *(str(int(drone)) if sure else "" for sure, drone in zip(known, is_drone, strict=True))]
+        with file.open(encoding="utf-8", newline="") as lines, labelled.open("w", encoding="utf-8", newline="") as out:
+            out.writelines(f"{line.rstrip()},{label}\r\n" for line, label in zip(lines, labels, strict=True))
+        labelled.replace(file)
+    except (OSError, ValueError, LinkError) as error:  # a live run may have lost lines to a full disk
+        labelled.unlink(missing_ok=True)
+        return f"{CANDIDATES_FILE} has no labels: {error}"
+    return ""
+
+
+def _used(file: Path) -> Iterator[tuple[int, float, float, float]]:
+    """Stamp [ns] and position [m] of each row."""
+    with file.open(encoding="utf-8", newline="") as stream:
+        for number, row in enumerate(csv.DictReader(stream), start=2):
+            if any(row.get(name) is None for name in USED):
+                raise LinkError(f"line {number} is cut off")
+            stamp_s, x, y, z = (row[name] for name in USED)
+            yield read_stamp_ns(stamp_s, f"line {number}"), float(x), float(y), float(z)

@@ -7,9 +7,8 @@ import json
 from pathlib import Path
 
 from flow.link import Record
-from links.runs.candidate_labels import label_candidates
 from links.runs.results import CANDIDATES_FILE
-from links.runs.truth import TruthLog
+from links.runs.truth import TruthLog, label_candidates
 
 STILL = {"xyz_m": [0.0, 0.0, 0.0], "quaternion_xyzw": [0.0, 0.0, 0.0, 1.0]}
 

@@ -72,3 +72,14 @@ def test_a_line_that_is_cut_off_leaves_the_log_as_it_is_and_is_reported(tmp_path
     assert "line 3 is cut off" in label_candidates(tmp_path, truth({"/truth/drone": 5.0}))
     assert file.read_bytes() == before
     assert [path.name for path in tmp_path.iterdir()] == [CANDIDATES_FILE]
+
+
+def test_where_the_truth_of_the_drone_is_invalid_there_is_no_label(tmp_path: Path):
+    file = candidates(tmp_path, NEAR.format("0.55"))
+    before = file.read_bytes()
+    log = truth({})
+    log.add_all([Record("/truth/drone", 1, 1, b"not JSON")])
+    assert label_candidates(tmp_path, log) == ""
+    assert file.read_bytes() == before
+    log.write(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == [CANDIDATES_FILE]

@@ -138,10 +138,11 @@ def interpolate(at_ns: Stamps, stamps_ns: Stamps, xyz_m: Array64, max_gap_ns: in
 def drone_labels(
     stamps_ns: Stamps, xyz_m: Array64, paths: Sequence[tuple[Stamps, Array64]], limits: EvaluationLimits
 ) -> tuple[Flags, Flags]:
-    """Positions (n, 3) [m] of which it is known whether they are of a drone, and those that are: flags (n,) each.
+    """Whether the truth decides what is at each position (n, 3) [m], and whether it is a drone: flags (n,) each.
 
-    Of a drone: within `false_m` of one then. `paths`: true stamps [ns] and positions [m] of all drones, maybe none. Not
-    known: the truth of a drone has a gap there, and no other is near.
+    It is a drone within `false_m` of one at that time. `paths`: true stamps [ns] and positions [m] of every drone, in
+    the same frame; none for a sky without drones. Not decided: the truth of a drone has a gap there, and no other drone
+    is near.
     """
     everywhere, is_drone = np.ones(len(stamps_ns), dtype=np.bool_), np.zeros(len(stamps_ns), dtype=np.bool_)
     for path in paths:

@@ -77,18 +77,10 @@ class RecordingMessages:
         self._invalid: Counter[str] = Counter()
 
     def of(self, record: Record) -> Iterator[Entry]:
-        """The messages of a record; packets are collected, records that are no valid JSON of their topic counted."""
+        """The messages of a record; packets are collected, invalid JSON is counted."""
         if not self._static_sent:
             self._static_sent = True
             yield from self._static(record.arrival_ns)
-        try:
-            entries = list(self._entries(record))
-        except INVALID:
-            self._invalid[record.topic] += 1
-            return
-        yield from entries
-
-    def _entries(self, record: Record) -> Iterator[Entry]:
         topic = record.topic
         if topic == "/lidar/packets":
             if self._lidar is None:
@@ -98,20 +90,30 @@ class RecordingMessages:
             self._packets.append(record)
             if (firings := self._lidar.decode(record)) is not None:
                 self._firings.append(firings)
-        elif topic == "/servo/state":
-            yield from self._servo(record)
         elif topic.startswith("/camera/"):
             yield from _image(record)
-        elif topic == "/vehicle/odometry":
-            yield from _odometry(record)
         elif topic in ("/autopilot/rx", "/autopilot/tx"):
             name = "/mavlink/from" if topic.endswith("rx") else "/mavlink/to"
             yield name, MAVLINK, record.arrival_ns, _mavlink(record)
-        elif topic in TRUTH_POSES:
-            values = {"header": header(record.stamp_ns, "world"), "pose": pose_values(*true_pose(record.data))}
-            yield topic, "geometry_msgs/msg/PoseStamped", record.arrival_ns, values
+        elif topic in ("/servo/state", "/vehicle/odometry", *TRUTH_POSES):
+            try:
+                entries = list(self._of_json(record))
+            except INVALID:
+                self._invalid[topic] += 1
+                return
+            yield from entries
         else:
             self._left_out[topic] += 1
+
+    def _of_json(self, record: Record) -> Iterator[Entry]:
+        """The messages of a record of the servo, the odometry or the truth. Raises one of INVALID."""
+        if record.topic == "/servo/state":
+            yield from self._servo(record)
+        elif record.topic == "/vehicle/odometry":
+            yield from _odometry(record)
+        else:
+            values = {"header": header(record.stamp_ns, "world"), "pose": pose_values(*true_pose(record.data))}
+            yield record.topic, "geometry_msgs/msg/PoseStamped", record.arrival_ns, values
 
     def end(self) -> Iterator[Entry]:
         """The collected packets and their points."""

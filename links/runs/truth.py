@@ -261,31 +261,30 @@ def fix_errors(
 
 
 def label_candidates(folder: Path, truth: TruthLog) -> str:
-    """Add the column to the candidate log of a run with truth. Returns why it was not possible, or an empty text."""
+    """Add the column `is_drone` to the candidate log of a run with truth. Returns why it cannot be added, or ''."""
     file = folder / CANDIDATES_FILE
     paths = [truth.drone_in_vehicle(number) for number, drone in sorted(truth.drones.items()) if drone.pose]
     if not file.exists() or not (paths or truth.no_drone):
         return ""
     labelled = file.with_suffix(".labelled")
     try:
-        rows = list(_used(file))
-        stamps_ns, xyz_m = np.array([row[0] for row in rows], dtype=np.int64), np.array([row[1:] for row in rows])
-        known, is_drone = drone_labels(stamps_ns, xyz_m.reshape(-1, 3), paths, EvaluationLimits())
+        rows = np.fromiter(_used(file), np.dtype([("stamp_ns", np.int64), ("xyz_m", np.float64, 3)]))
+        known, is_drone = drone_labels(rows["stamp_ns"], rows["xyz_m"], paths, EvaluationLimits())
         labels = [LABEL, *(str(int(drone)) if sure else "" for sure, drone in zip(known, is_drone, strict=True))]
         with file.open(encoding="utf-8", newline="") as lines, labelled.open("w", encoding="utf-8", newline="") as out:
-            out.writelines(f"{line.rstrip()},{label}\r\n" for line, label in zip(lines, labels, strict=True))
+            out.writelines(line.rstrip("\r\n") + f",{label}\r\n" for line, label in zip(lines, labels, strict=True))
         labelled.replace(file)
     except (OSError, ValueError, LinkError) as error:  # a live run may have lost lines to a full disk
         labelled.unlink(missing_ok=True)
-        return f"{CANDIDATES_FILE} has no labels: {error}"
+        return f"{CANDIDATES_FILE} has no column {LABEL}: {error}. To get it, replay the recording"
     return ""
 
 
-def _used(file: Path) -> Iterator[tuple[int, float, float, float]]:
-    """Stamp [ns] and position [m] of each row."""
+def _used(file: Path) -> Iterator[tuple[int, tuple[float, float, float]]]:
+    """Stamp [ns] and position [m], vehicle frame, of each row."""
     with file.open(encoding="utf-8", newline="") as stream:
         for number, row in enumerate(csv.DictReader(stream), start=2):
             if any(row.get(name) is None for name in USED):
                 raise LinkError(f"line {number} is cut off")
             stamp_s, x, y, z = (row[name] for name in USED)
-            yield read_stamp_ns(stamp_s, f"line {number}"), float(x), float(y), float(z)
+            yield read_stamp_ns(stamp_s, f"line {number}"), (float(x), float(y), float(z))

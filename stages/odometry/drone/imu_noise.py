@@ -9,11 +9,18 @@ samples about a curve of 0.22 s, which contain frequencies above some 6 Hz, stat
 
 A window of 0.44 s (twice `noise_window_s`) lets motion below some 3 Hz pass into the parabola: manoeuvres are not
 noise. The variance is averaged with the time constant `average_s`; one window counts at most as LARGEST times the
-average, because a gust or a touch-down is not vibration. Vibration may be a tone: one that is aliased to below 3 Hz is
-not seen here and acts as a bias.
+average, because a gust or a touch-down is not vibration.
 
-Single samples contain what blocks average out, tones of the rotors above 10 Hz, which thrust may move to any alias.
-The larger of the two densities counts, of single samples and of blocks (inertial_motion.py).
+Of several densities the largest counts (inertial_motion.py):
+
+- Single samples contain what blocks average out, tones of the rotors above 10 Hz, which thrust may move to any alias.
+- Blocks of 0.1 and 0.2 s, in windows of 0.9 and 1.8 s, contain frequencies down to 1.5 and 0.75 Hz. A rotor that turns
+  near a multiple of the sampling rate is aliased to there. Compared with LiDAR positions this would be motion. Only the
+  specific force is judged so: it is thrust along z and drag across, and changes little at these frequencies, while the
+  turn rate does. In the log above its density is 0.11 to 0.21 m/s^2/sqrt(Hz) at 0.75 to 2.5 Hz and 0.11 to 0.24 at 2.5
+  to 5 Hz.
+
+A tone that is aliased to below 0.75 Hz is not seen, and acts as a bias.
 
 Source: ours; A. Savitzky, M. J. E. Golay, "Smoothing and Differentiation of Data by Simplified Least Squares
 Procedures", 1964; cut-off frequency by R. W. Schafer, "What Is a Savitzky-Golay Filter?", IEEE SPM 28(4), 2011.

@@ -31,6 +31,7 @@ from stages.odometry.drone.imu_noise import NoiseDensity
 from stages.odometry.drone.imu_outliers import FalseSamples
 from stages.odometry.drone.magnetic_gyro_bias import MagneticGyroBias
 
+SLOW_BLOCKS = 2, 4  # durations, in noise_block_s, of the blocks for slow noise of the specific force
 CLOCK_SET_NS = 1_000_000_000  # a stamp that is earlier by more: the clock was set; by less: late or repeated
 
 
@@ -60,6 +61,9 @@ class InertialMotion(Stage[InertialMotionSettings]):
         self._noise = (
             NoiseDensity(0.0, s.noise_window_s, s.noise_average_s),
             NoiseDensity(s.noise_block_s, 2 * s.noise_window_s, s.noise_average_s),
+        )
+        self._slow_noise = tuple(
+            NoiseDensity(k * s.noise_block_s, 2 * k * s.noise_window_s, k * s.noise_average_s) for k in SLOW_BLOCKS
         )
         self._false = FalseSamples()
         self._magnetic = MagneticGyroBias()
@@ -123,7 +127,7 @@ class InertialMotion(Stage[InertialMotionSettings]):
         )
 
     def _begin(self, imu: DroneImu) -> None:
-        for noise in self._noise:
+        for noise in (*self._noise, *self._slow_noise):
             noise.new_segment()
         self._false.new_segment()
         self._magnetic.restart()
@@ -135,7 +139,7 @@ class InertialMotion(Stage[InertialMotionSettings]):
         return self._false.add(imu.stamp_ns, imu.acceleration_drone_mps2, imu.angular_velocity_drone_radps)
 
     def _add(self, imu: DroneImu) -> None:
-        for noise in self._noise:
+        for noise in (*self._noise, *self._slow_noise):
             noise.add(imu.stamp_ns, imu.acceleration_drone_mps2, imu.angular_velocity_drone_radps)
         self._last = imu
 
@@ -145,4 +149,8 @@ class InertialMotion(Stage[InertialMotionSettings]):
         known = [noise.density for noise in self._noise if noise.density is not None]
         if not known:
             known = [np.outer([s.initial_force_mps2, s.initial_rate_radps], np.full(3, math.sqrt(dt_s)))]
-        return np.maximum.reduce([*known, np.outer([s.least_force_noise, s.least_rate_noise], np.ones(3))])
+        densities = np.maximum.reduce([*known, np.outer([s.least_force_noise, s.least_rate_noise], np.ones(3))])
+        for noise in self._slow_noise:
+            if noise.density is not None:
+                densities[0] = np.maximum(densities[0], noise.density[0])
+        return densities

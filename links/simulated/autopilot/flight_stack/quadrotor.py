@@ -28,6 +28,7 @@ from stages.geometry.frames import Array64
 STEPS = 4  # of STEP_S per tick
 TICK_S = STEPS * STEP_S
 ROTORS = 4
+ROTOR_HZ = 65.0, 125.0  # 3900 to 7500 rpm: propellers of 15 to 9 inch in hover
 SPREAD = (0.97, 1.01, 0.99, 1.03)  # rotation rates of the rotors relative to their mean
 
 
@@ -77,12 +78,13 @@ class Quadrotor:
         )
         self._wind = np.array(wind.mean_world_mps) + gusts
         self._rng = np.random.default_rng([seed, 41])
-        self._imu = imu_errors(settings.imu, rng)
+        rotor_hz = settings.imu.rotor_hz or np.random.default_rng([seed, 44]).uniform(*ROTOR_HZ)
+        self._imu = imu_errors(settings.imu, rotor_hz, rng)
         self._coefficients = butterworth(settings.imu.filter_hz, 1 / STEP_S)
         self._filters = np.zeros((6, 2))
-        rate_hz = settings.imu.rotor_hz * np.array(SPREAD)
+        rates_hz = rotor_hz * np.array(SPREAD)
         self._rotors = np.hstack(
-            [rng.uniform(0, 2 * np.pi, (ROTORS, 1)), rate_hz[:, None], rng.uniform(0, 2 * np.pi, (ROTORS, 6))]
+            [rng.uniform(0, 2 * np.pi, (ROTORS, 1)), rates_hz[:, None], rng.uniform(0, 2 * np.pi, (ROTORS, 6))]
         )
         self._ticks = 0
 
@@ -136,13 +138,13 @@ class Quadrotor:
         return tick
 
 
-def imu_errors(s: ImuSettings, rng: np.random.Generator) -> Array64:
+def imu_errors(s: ImuSettings, rotor_hz: float, rng: np.random.Generator) -> Array64:
     """Biases (6), white noise of gyro and accelerometer, vibration amplitudes (6) for `fly_steps`.
 
     The vibration settings are RMS values after the low-pass; a rotor's tone and its harmonic add
     (|H(f)|^2 + |H(2 f)|^2 / 4) / 2 to the variance per squared amplitude.
     """
-    h1, h2 = gain(s.filter_hz, s.rotor_hz, 1 / STEP_S), gain(s.filter_hz, 2 * s.rotor_hz, 1 / STEP_S)
+    h1, h2 = gain(s.filter_hz, rotor_hz, 1 / STEP_S), gain(s.filter_hz, 2 * rotor_hz, 1 / STEP_S)
     one = math.sqrt(ROTORS * 0.5 * (h1 * h1 + 0.25 * h2 * h2))
     gyro_bias = math.radians(s.gyro_bias_degps) * rng.standard_normal(3)
     accelerometer_bias = s.accelerometer_bias_mps2 * rng.standard_normal(3)

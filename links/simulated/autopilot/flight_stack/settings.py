@@ -29,7 +29,7 @@ class ImuSettings(StrictModel):
     accelerometer_white_mps2: float = Field(default=0.03, ge=0)  # per 400 Hz sample
     vibration_mps2: float = Field(default=0.3, ge=0, le=30)  # RMS per axis in hover, of the reported accelerometer
     vibration_degps: float = Field(default=0.5, ge=0, le=100)  # the same of the gyro
-    rotor_hz: float = Field(default=83.0, ge=20, le=180)  # in hover; 5000 rpm
+    rotor_hz: float | None = Field(default=None, ge=20, le=180)  # in hover; None: drawn by the seed from 65 to 125
     filter_hz: float = Field(default=20.0, ge=5, le=190)
 
 

@@ -92,6 +92,20 @@ def test_the_noise_is_never_below_that_of_a_sensor_and_has_a_default_before_it_i
     assert made.angular_velocity_noise.tolist() == [9e-5] * 3
 
 
+@pytest.mark.parametrize(("hz", "tone_hz"), [(50, 51.2), (50, 98.4), (25, 101.0), (10, 90.9), (10, 81.5)])
+def test_a_tone_of_the_rotors_that_is_aliased_to_slow_motion_is_noise_of_the_specific_force(hz: int, tone_hz: float):
+    """0.3 m/s^2 RMS; all of it is between 0.75 and 2.5 Hz in the samples, which has the density 0.3 / sqrt(2 x 1.75)."""
+    stage, rng = InertialMotion(), np.random.default_rng(3)
+    for i in range(20 * hz):
+        tone = 0.3 * np.sqrt(2) * np.sin(2 * np.pi * tone_hz * i / hz + np.array([0.0, 1.0, 2.0]))
+        force = np.array([0, 0, 9.8]) + tone + rng.normal(0, 0.03, 3)
+        made = stage.on_imu(imu(1000 * i / hz, acceleration_drone_mps2=force))
+    assert made is not None
+    assert made.specific_force_noise.min() > 0.6 * 0.3 / np.sqrt(3.5)
+    assert made.specific_force_noise.max() < 1.6 * 0.3 / np.sqrt(3.5)
+    assert made.angular_velocity_noise.max() < 0.001, "a turn rate at these frequencies is motion"
+
+
 def test_up_is_the_autopilots_vertical_at_the_end_of_the_interval():
     stage = InertialMotion()
     stage.on_tilt(tilt(0))

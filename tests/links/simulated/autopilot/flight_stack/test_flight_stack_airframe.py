@@ -113,13 +113,26 @@ def test_vibration_has_the_set_size_in_what_is_reported(vibration_mps2: float) -
 
 def test_vibration_aliases_into_a_50_hz_stream() -> None:
     """83 Hz at 97, 101, 99 and 103 % are tones of 80.5 to 85.5 Hz: sampled at 50 Hz they appear at 14.5 to 19.5 Hz."""
-    imu = IDEAL.model_copy(update={"vibration_mps2": 0.3})
+    imu = IDEAL.model_copy(update={"vibration_mps2": 0.3, "rotor_hz": 83.0})
     slow = fly(quadrotor(imu), 21.0)[400 :: round(1 / STEP_S / 50), 5]
     power = np.abs(np.fft.rfft(slow - slow.mean())) ** 2
     frequency_hz = np.fft.rfftfreq(len(slow), 1 / 50)
     aliased = [abs(83.0 * share - 100.0) for share in (0.97, 1.01, 0.99, 1.03)]
     in_band = (frequency_hz > min(aliased) - 0.3) & (frequency_hz < max(aliased) + 0.3)
     assert power[in_band].sum() > 0.85 * power.sum()
+
+
+def test_each_seed_draws_its_rate_of_the_rotors() -> None:
+    rates_hz = [strongest_hz(seed) for seed in (1, 1, 2, 3)]
+    assert rates_hz[0] == rates_hz[1]
+    assert len(set(rates_hz)) == 3
+    assert all(65.0 * 0.96 < rate < 125.0 * 1.04 for rate in rates_hz)
+
+
+def strongest_hz(seed: int) -> float:
+    """Frequency of the strongest tone in the reported vertical acceleration."""
+    shaken = fly(quadrotor(IDEAL.model_copy(update={"vibration_mps2": 0.3}), seed=seed), 6.0)[400:, 5]
+    return float(np.fft.rfftfreq(len(shaken), STEP_S)[np.argmax(np.abs(np.fft.rfft(shaken - shaken.mean())))])
 
 
 def test_biases_are_in_the_samples() -> None:

@@ -5,7 +5,7 @@ The attitude controller sees the *estimated* attitude only; truth moves the airf
 
     acceleration = R [0, 0, thrust] - DRAG (v - wind) - g
     thrust, turn rate: first-order lags behind their commands
-    IMU: R^T (acceleration + g) and turn rate, with bias, white noise and rotor vibration
+    IMU: R^T (acceleration + g) and turn rate, with bias, white noise and rotor vibration; the gyro with a scale error
 
 Vibration is a sum over the rotors of a tone at the rotation rate (imbalance) and one of half its size at twice the rate
 (two blades), with phases of its own on each axis. The rate goes with the root of the thrust. A stream slower than twice
@@ -49,10 +49,11 @@ def fly_steps(
 
     state (17,) and estimate (16,: p, v, q, gyro bias, accelerometer bias in the estimator's frame) are updated. command
     (7,): desired acceleration + g in the estimator's frame, yaw, yaw rate, 1: motors run, ground height. wind (n, 3);
-    noise (n, 6) standard normal; limits as of `fly`; imu (14,): gyro bias, accelerometer bias, their white noise per
-    sample, vibration amplitude of gyro and accelerometer (3 each). rotors (4, 8): phase, rate [Hz], phase offset of the
-    six axes. filters (6, 2) and coefficients (5,): the low-pass of the reported samples. rows (n, 17), samples (n, 6),
-    estimates (n, 10) take each step's truth, reported gyro and accelerometer, and estimate.
+    noise (n, 6) standard normal; limits as of `fly`; imu (17,): gyro bias, accelerometer bias, their white noise per
+    sample, vibration amplitude of gyro and accelerometer, scale error of the gyro (3 each, but one white noise each).
+    rotors (4, 8): phase, rate [Hz], phase offset of the six axes. filters (6, 2) and coefficients (5,): the low-pass of
+    the reported samples. rows (n, 17), samples (n, 6), estimates (n, 10) take each step's truth, reported gyro and
+    accelerometer, and estimate.
     """
     gain, max_rate, max_yaw_rate, rate_lag, thrust_lag, max_slope = limits
     R, S, force, drag, desired = np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3)
@@ -91,7 +92,7 @@ def fly_steps(
             for rotor in range(rotors.shape[0]):
                 angle = rotors[rotor, 0] + rotors[rotor, 2 + i]
                 shake += np.sin(angle) + 0.5 * np.sin(2 * angle)
-            true = state[10 + i] if i < 3 else force[i - 3]
+            true = state[10 + i] * (1.0 + imu[14 + i]) if i < 3 else force[i - 3]
             white = imu[6] if i < 3 else imu[7]
             raw[i] = true + imu[i] + white * noise[k, i] + (imu[8 + i] * shake if running else 0.0)
             moved[i] += raw[i] * STEP_S

@@ -6,11 +6,16 @@ left out (imu_outliers.py). A gap, and a clock that was set back, end a segment.
 are the drone's own measurements; the autopilot's position, velocity and yaw are added only while they cannot contain a
 pose that grd sent (`independent`). Of the magnetometer only the bias of the gyro is used (magnetic_gyro_bias.py).
 
+A gyro whose scale is wrong by s measures a turn by the angle a wrong by s a. While the drone turns on, at the rate w,
+the variance s^2 a^2 grows by 2 s^2 a w per second, which is added to the square of the rate's density; turning back
+adds nothing. `a` is the turn of the last TURN_S, with exponential weights: what came before has been observed since.
+
 The noise is a density, estimated from the samples (imu_noise.py): with a density d the variance of the velocity grows
 by d^2 per second. Until it is known, samples with white noise s at intervals of dt have the density s sqrt(dt).
 
 Source: ours; P V.B, V.E. Initial noise: ArduPilot EK3_ACC_P_NSE 0.35 m/s^2 and EK3_GYRO_P_NSE 0.015 rad/s; least noise:
-MPU-6000 product specification 3.4, 6.1 and 6.2 (400 ug/sqrt(Hz), 0.005 deg/s/sqrt(Hz)).
+MPU-6000 product specification 3.4, 6.1 and 6.2 (400 ug/sqrt(Hz), 0.005 deg/s/sqrt(Hz); scale within 3 %). Scale: in the
+log of a flight (Pixhawk) two gyros differ by 1.6, 3.9 and 2.2 % in x, y and z.
 """
 
 from __future__ import annotations
@@ -32,6 +37,7 @@ from stages.odometry.drone.imu_outliers import FalseSamples
 from stages.odometry.drone.magnetic_gyro_bias import MagneticGyroBias
 
 SLOW_BLOCKS = 2, 4  # durations, in noise_block_s, of the blocks for slow noise of the specific force
+TURN_S = 30.0
 CLOCK_SET_NS = 1_000_000_000  # a stamp that is earlier by more: the clock was set; by less: late or repeated
 
 
@@ -44,6 +50,7 @@ class InertialMotionSettings(Settings):
     noise_average_s: float = Field(2.0, gt=0, le=60)
     initial_force_mps2: float = Field(0.35, gt=0)  # noise of a sample, until it is estimated
     initial_rate_radps: float = Field(0.015, gt=0)
+    gyro_scale: float = Field(0.015, ge=0, le=0.1)  # error of the scale, one sigma of each axis
     least_force_noise: float = Field(0.004, gt=0)  # density [m/s^2/sqrt(Hz)]
     least_rate_noise: float = Field(9e-5, gt=0)  # density [rad/s/sqrt(Hz)]
     autopilot_age_s: float = Field(0.25, gt=0, le=2)  # longest propagation of the autopilot's attitude and position
@@ -68,6 +75,7 @@ class InertialMotion(Stage[InertialMotionSettings]):
         self._false = FalseSamples()
         self._magnetic = MagneticGyroBias()
         self._last: DroneImu | None = None
+        self._turn_rad = np.zeros(3)
         self._segment = 0
         self._counts: Counter[str] = Counter()
 
@@ -111,7 +119,7 @@ class InertialMotion(Stage[InertialMotionSettings]):
         rate = 0.5 * (last.angular_velocity_drone_radps + imu.angular_velocity_drone_radps)
         self._add(imu)
         self._autopilot.on_imu(force, rate)
-        force_noise, rate_noise = self._noise_densities(dt_ns * 1e-9)
+        force_noise, rate_noise = self._noise_densities(dt_ns * 1e-9, rate)
         up = self._autopilot.up_drone(imu.stamp_ns)
         return DroneMotion(
             stamp_ns=imu.stamp_ns,
@@ -131,6 +139,7 @@ class InertialMotion(Stage[InertialMotionSettings]):
             noise.new_segment()
         self._false.new_segment()
         self._magnetic.restart()
+        self._turn_rad = np.zeros(3)
         self._add_to_outlier_check(imu)  # too few samples to be false
         self._add(imu)
 
@@ -143,7 +152,7 @@ class InertialMotion(Stage[InertialMotionSettings]):
             noise.add(imu.stamp_ns, imu.acceleration_drone_mps2, imu.angular_velocity_drone_radps)
         self._last = imu
 
-    def _noise_densities(self, dt_s: float) -> Array64:
+    def _noise_densities(self, dt_s: float, rate: Array64) -> Array64:
         """Noise densities (2, 3) of specific force and rate over an interval."""
         s = self.settings
         known = [noise.density for noise in self._noise if noise.density is not None]
@@ -153,4 +162,6 @@ class InertialMotion(Stage[InertialMotionSettings]):
         for noise in self._slow_noise:
             if noise.density is not None:
                 densities[0] = np.maximum(densities[0], noise.density[0])
+        self._turn_rad = math.exp(-dt_s / TURN_S) * self._turn_rad + dt_s * rate
+        densities[1] = np.sqrt(densities[1] ** 2 + 2 * s.gyro_scale**2 * np.maximum(self._turn_rad * rate, 0.0))
         return densities

@@ -9,8 +9,10 @@ drone's yaw alone. Over a window the field, rotated to the axes of the window's 
 The slope of phi is a measurement of u . b. The changes of the compass error are taken as a random walk of the heading;
 independent slopes of consecutive windows then carry the information of the whole. The variance is estimated from the
 slopes themselves: half the mean squared difference of two consecutive ones, of windows and of LONG windows together;
-the larger one counts, because a compass that drifts over many seconds has alike slopes in two short windows. A window
-with a turn is not used: the error depends on the heading.
+the larger one counts, because a compass that drifts over many seconds has alike slopes in two short windows.
+
+The error also depends on the heading. A window with a turn is not used. In a slower one the sigma contains IRON times
+the turn, since a steady turn has alike slopes.
 
 In the log of a flight (Pixhawk, ArduCopter 3, two compasses, against its own yaw by GPS) the error of the external
 compass changes by 3 deg/sqrt(s) in manoeuvres and by 10 deg for each radian turned, and on the ground by 0.6 deg in
@@ -34,6 +36,7 @@ from stages.sums import sum_in_order
 WINDOW_S, LONG = 2.0, 4  # one window; the number of them in a long one
 LEAST_SAMPLES = 5  # of the field, in a window
 MOST_TURN_RAD = math.radians(10.0)  # of the drone in a window
+IRON = math.radians(10.0)  # change of the compass error in a turn [rad/rad], of the log above
 LEAST_WALK = math.radians(0.15)  # of the compass error [rad/sqrt(s)]
 FIRST_WALK = math.radians(1.5)  # until the slopes show it: between hovering and manoeuvres
 FIRST_COUNTS = 2.0  # differences of slopes that the first value counts as
@@ -99,8 +102,8 @@ class MagneticGyroBias:
         self.restart()
 
     def _close(self) -> GyroBias | None:
-        samples, seconds = np.array(self._samples), self._seconds
-        if len(samples) < LEAST_SAMPLES or abs(self._turn_rad) > MOST_TURN_RAD:
+        samples, seconds, turn_rad = np.array(self._samples), self._seconds, self._turn_rad
+        if len(samples) < LEAST_SAMPLES or abs(turn_rad) > MOST_TURN_RAD:
             self._interrupt()
             return None
         up = self._up / np.linalg.norm(self._up)
@@ -113,6 +116,7 @@ class MagneticGyroBias:
             self._long.add(sum_in_order(self._slopes) / LONG)
             self._slopes.clear()
         variance = max(self._short.variance, LONG * self._long.variance, _walk_variance(LEAST_WALK, seconds))
+        variance += (IRON * turn_rad / seconds) ** 2
         return GyroBias(up_drone=up, bias_radps=slope, sigma_radps=math.sqrt(variance))
 
 

@@ -78,8 +78,10 @@ class Quadrotor:
         )
         self._wind = np.array(wind.mean_world_mps) + gusts
         self._rng = np.random.default_rng([seed, 41])
-        rotor_hz = settings.imu.rotor_hz or np.random.default_rng([seed, 44]).uniform(*ROTOR_HZ)
-        self._imu = imu_errors(settings.imu, rotor_hz, rng)
+        further = np.random.default_rng([seed, 44])
+        rotor_hz = settings.imu.rotor_hz or further.uniform(*ROTOR_HZ)
+        scale = settings.imu.gyro_scale * further.standard_normal(3)
+        self._imu = np.concatenate([imu_errors(settings.imu, rotor_hz, rng), scale])
         self._coefficients = butterworth(settings.imu.filter_hz, 1 / STEP_S)
         self._filters = np.zeros((6, 2))
         rates_hz = rotor_hz * np.array(SPREAD)

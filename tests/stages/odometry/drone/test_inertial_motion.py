@@ -83,11 +83,11 @@ def test_the_density_is_the_sample_noise_times_the_root_of_the_interval():
 
 
 def test_the_noise_is_never_below_that_of_a_sensor_and_has_a_default_before_it_is_estimated():
-    stage = InertialMotion()
-    stage.on_imu(imu(0))
-    np.testing.assert_allclose(motion(stage, 20).specific_force_noise, 0.35 * np.sqrt(0.02))
+    stage, still = InertialMotion(), {"angular_velocity_drone_radps": np.zeros(3)}
+    stage.on_imu(imu(0, **still))
+    np.testing.assert_allclose(motion(stage, 20, **still).specific_force_noise, 0.35 * np.sqrt(0.02))
     for i in range(2, 200):
-        made = motion(stage, 20 * i)
+        made = motion(stage, 20 * i, **still)
     assert made.specific_force_noise.tolist() == [0.004] * 3
     assert made.angular_velocity_noise.tolist() == [9e-5] * 3
 
@@ -99,11 +99,28 @@ def test_a_tone_of_the_rotors_that_is_aliased_to_slow_motion_is_noise_of_the_spe
     for i in range(20 * hz):
         tone = 0.3 * np.sqrt(2) * np.sin(2 * np.pi * tone_hz * i / hz + np.array([0.0, 1.0, 2.0]))
         force = np.array([0, 0, 9.8]) + tone + rng.normal(0, 0.03, 3)
-        made = stage.on_imu(imu(1000 * i / hz, acceleration_drone_mps2=force))
+        made = stage.on_imu(imu(1000 * i / hz, acceleration_drone_mps2=force, angular_velocity_drone_radps=np.zeros(3)))
     assert made is not None
     assert made.specific_force_noise.min() > 0.6 * 0.3 / np.sqrt(3.5)
     assert made.specific_force_noise.max() < 1.6 * 0.3 / np.sqrt(3.5)
     assert made.angular_velocity_noise.max() < 0.001, "a turn rate at these frequencies is motion"
+
+
+def test_a_turn_is_as_uncertain_as_the_scale_of_the_gyro_and_a_wobble_is_not():
+    """A turn by 1.6 rad in 4 s, alone and back again, and a wobble of +-0.13 rad for 12 s."""
+    rates = {
+        "turn": np.where(np.arange(600) < 200, 0.4, 0.0),
+        "back": np.where(np.arange(600) < 200, 0.4, np.where(np.arange(600) < 400, -0.4, 0.0)),
+        "wobble": 0.4 * np.sin(2 * np.pi * 0.5 * 0.02 * np.arange(600)),
+    }
+    sigma_rad = {}
+    for name, rate in rates.items():
+        stage = InertialMotion(gyro_scale=0.015)
+        made = [stage.on_imu(imu(20 * i, angular_velocity_drone_radps=np.array([0, 0, w]))) for i, w in enumerate(rate)]
+        sigma_rad[name] = np.sqrt(sum(0.02 * m.angular_velocity_noise[2] ** 2 for m in made if m))
+    assert sigma_rad["turn"] == pytest.approx(0.015 * 1.6, rel=0.15)
+    assert sigma_rad["back"] == pytest.approx(sigma_rad["turn"], rel=0.15)
+    assert sigma_rad["wobble"] < 0.5 * sigma_rad["turn"]
 
 
 def test_up_is_the_autopilots_vertical_at_the_end_of_the_interval():

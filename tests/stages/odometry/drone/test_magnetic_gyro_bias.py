@@ -84,6 +84,17 @@ def test_a_compass_that_drifts_for_seconds_is_not_taken_for_a_bias():
     assert abs(off @ weight / weight.sum()) < 2.0 / math.sqrt(weight.sum())
 
 
+def test_in_a_slow_turn_an_error_that_depends_on_the_heading_is_in_the_sigma():
+    """10 deg of compass error per radian turned, as in the log of a flight; each window turns by 5.7 deg."""
+    found = measured(
+        np.zeros(3), 60.0, turn_rate=lambda t: 0.05, compass_error_rad=lambda t: math.radians(10.0) * 0.05 * t
+    )
+    assert len(found) == 29
+    for one in found:
+        assert abs(one.bias_radps) > 0.008
+        assert abs(one.bias_radps) < 1.1 * one.sigma_radps
+
+
 def test_a_turn_is_not_used():
     """The error of a compass depends on its heading: 10 deg for each radian."""
     turning = lambda t: 0.5 if 8.0 <= t < 12.0 else 0.0  # noqa: E731

@@ -173,7 +173,7 @@ def test_after_a_kill_grd_starts_again_and_the_flight_goes_on() -> None:
 
 @pytest.mark.parametrize(
     ("config", "flight", "killed_s"),
-    [("sim_flight_yaw_fixes", "hover_yaw_fixes", (22.0, 23.0)), ("sim_flight_fixes", "hover_fixes", (14.0, 15.0))],
+    [("sim_flight_yaw_fixes", "matrix/brisk", (22.0, 23.0)), ("sim_flight_fixes", "hover_fixes", (14.0, 15.0))],
 )
 def test_after_a_kill_with_a_state_file_poses_are_sent_again_within_5_s(
     config: str, flight: str, killed_s: tuple[float, float], tmp_path: Path
@@ -182,8 +182,11 @@ def test_after_a_kill_with_a_state_file_poses_are_sent_again_within_5_s(
     state = f"links: {{autopilot: {{config: {{state_file: {tmp_path / 'sent.json'}}}}}}}"
     (tmp_path / "config.yaml").write_text(f"include: {ROOT / 'configs' / config}.yaml\n{state}\n", encoding="utf-8")
     plan = [{"do": "path", "for_s": killed_s[0] - 1}, {"do": "use_sources", "set": 2}, {"do": "hold", "for_s": 40}]
+    own_set = "external_no_velocity" if "yaw" in config else "external_position"
     scenario = changed(
-        load_scenario(ROOT / "configs/scenarios/flight" / f"{flight}.yaml"), killed_s[1] + 4, {"plan": plan}
+        load_scenario(ROOT / "configs/scenarios/flight" / f"{flight}.yaml"),
+        killed_s[1] + 4,
+        {"plan": plan, "source_sets": ["gps", own_set]},
     )
     scenario = scenario.changed(closed_loop={"killed_s": killed_s})
     loop = load_loop(tmp_path / "config.yaml", scenario.rig_yaml(), "test", scenario.closed_loop)

@@ -14,8 +14,8 @@ The noise is a density, estimated from the samples (imu_noise.py): with a densit
 by d^2 per second. Until it is known, samples with white noise s at intervals of dt have the density s sqrt(dt).
 
 Source: ours; P V.B, V.E. Initial noise: ArduPilot EK3_ACC_P_NSE 0.35 m/s^2 and EK3_GYRO_P_NSE 0.015 rad/s; least noise:
-MPU-6000 product specification 3.4, 6.1 and 6.2 (400 ug/sqrt(Hz), 0.005 deg/s/sqrt(Hz); scale within 3 %). Scale: in the
-log of a flight (Pixhawk) two gyros differ by 1.6, 3.9 and 2.2 % in x, y and z.
+MPU-6000 product specification 3.4, 6.1 and 6.2 (400 ug/sqrt(Hz), 0.005 deg/s/sqrt(Hz)). Scale: the same, within 3 %,
+taken as two sigma; in the log of a flight (Pixhawk) two gyros differ by 1.6, 3.9 and 2.2 % in x, y and z.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from stages.odometry.drone.imu_outliers import FalseSamples
 from stages.odometry.drone.magnetic_gyro_bias import MagneticGyroBias
 
 SLOW_BLOCKS = 2, 4  # durations, in noise_block_s, of the blocks for slow noise of the specific force
-TURN_S = 30.0
+TURN_S = 30.0  # memory of a turn; by IMU alone the yaw is measured anew in some 20 s (median of a real flight)
 CLOCK_SET_NS = 1_000_000_000  # a stamp that is earlier by more: the clock was set; by less: late or repeated
 
 
@@ -75,7 +75,7 @@ class InertialMotion(Stage[InertialMotionSettings]):
         self._false = FalseSamples()
         self._magnetic = MagneticGyroBias()
         self._last: DroneImu | None = None
-        self._turn_rad = np.zeros(3)
+        self._turn_rad = np.zeros(3)  # of the last TURN_S, drone axes
         self._segment = 0
         self._counts: Counter[str] = Counter()
 
@@ -119,6 +119,7 @@ class InertialMotion(Stage[InertialMotionSettings]):
         rate = 0.5 * (last.angular_velocity_drone_radps + imu.angular_velocity_drone_radps)
         self._add(imu)
         self._autopilot.on_imu(force, rate)
+        self._turn_rad = math.exp(-dt_ns * 1e-9 / TURN_S) * self._turn_rad + dt_ns * 1e-9 * rate
         force_noise, rate_noise = self._noise_densities(dt_ns * 1e-9, rate)
         up = self._autopilot.up_drone(imu.stamp_ns)
         return DroneMotion(
@@ -162,6 +163,5 @@ class InertialMotion(Stage[InertialMotionSettings]):
         for noise in self._slow_noise:
             if noise.density is not None:
                 densities[0] = np.maximum(densities[0], noise.density[0])
-        self._turn_rad = math.exp(-dt_s / TURN_S) * self._turn_rad + dt_s * rate
         densities[1] = np.sqrt(densities[1] ** 2 + 2 * s.gyro_scale**2 * np.maximum(self._turn_rad * rate, 0.0))
         return densities

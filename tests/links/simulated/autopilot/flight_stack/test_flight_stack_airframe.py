@@ -15,7 +15,7 @@ from links.simulated.kernels.motion import DRAG_PER_S, GRAVITY_MPS2, STEP_S
 STILL = WindSettings(gust_mps=0.0)
 IDEAL = ImuSettings(
     gyro_bias_degps=0, accelerometer_bias_mps2=0, gyro_white_degps=0, accelerometer_white_mps2=0, vibration_mps2=0,
-    vibration_degps=0,
+    vibration_degps=0, gyro_scale=0,
 )  # fmt: skip
 LEVEL = np.array([0.0, 0.0, GRAVITY_MPS2, 0.0, 0.0, 1.0])  # acceleration + g, yaw, yaw rate, motors run
 
@@ -133,6 +133,19 @@ def strongest_hz(seed: int) -> float:
     """Frequency of the strongest tone in the reported vertical acceleration."""
     shaken = fly(quadrotor(IDEAL.model_copy(update={"vibration_mps2": 0.3}), seed=seed), 6.0)[400:, 5]
     return float(np.fft.rfftfreq(len(shaken), STEP_S)[np.argmax(np.abs(np.fft.rfft(shaken - shaken.mean())))])
+
+
+def test_the_gyro_has_a_scale_error_and_the_accelerometer_none() -> None:
+    turning = np.array([0.0, 0.0, GRAVITY_MPS2, 2.5, 0.0, 1.0])
+    ratio, force = [], []
+    for scale in (0.0, 0.05):
+        drone = quadrotor(IDEAL.model_copy(update={"gyro_scale": scale}))
+        samples = fly(drone, 1.0, turning)
+        ratio.append(samples[-1, 2] / drone.state[12])
+        force.append(samples[-1, 5])
+    assert ratio[0] == pytest.approx(1.0, abs=2e-3)
+    assert abs(ratio[1] - 1.0) > 0.01
+    assert force == pytest.approx([GRAVITY_MPS2] * 2, abs=1e-6)
 
 
 def test_biases_are_in_the_samples() -> None:

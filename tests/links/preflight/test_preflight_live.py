@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Self, TypeVar
 
 import pytest
 from typer.testing import CliRunner
@@ -34,6 +36,8 @@ from tests.links.preflight.sending_lidar import SendingLidar
 
 ROOT = Path(__file__).resolve().parents[3]
 LISTEN_S = 2.2
+MOST_REPEATED, LONGEST_STOP_S = 4, 0.3
+T = TypeVar("T")
 CONFIG = """\
 include: {included}
 links:
@@ -96,13 +100,46 @@ def wait(seconds: float) -> None:
 
 
 def results_of(graph: Graph, ask=None, listen_s=LISTEN_S):
-    return {v.name: v for v in preflight_live(graph, listen_s, wait, ask, step_s=0.6)}
+    return undisturbed(lambda: {v.name: v for v in preflight_live(graph, listen_s, wait, ask, step_s=0.6)})
+
+
+class StopWatch(threading.Thread):
+    """Measures for how long the host did not run this process, at most."""
+
+    def __init__(self) -> None:
+        super().__init__(daemon=True)
+        self._done, self.longest_s = threading.Event(), 0.0
+
+    def run(self) -> None:
+        last = time.monotonic()
+        while not self._done.wait(0.02):
+            now = time.monotonic()
+            self.longest_s, last = max(self.longest_s, now - last), now
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(self, *_) -> None:
+        self._done.set()
+        self.join()
+
+
+def undisturbed(measure: Callable[[], T]) -> T:
+    """A measurement in real time; it is repeated when a busy host stopped this process, and the peers in it."""
+    for _ in range(MOST_REPEATED):
+        with StopWatch() as watch:
+            result = measure()
+        if watch.longest_s < LONGEST_STOP_S:
+            break
+    return result
 
 
 def test_a_ready_rig_is_go_with_exit_code_0(bench, emulator):
     bench.write(emulator.path)
     with SendingLidar(bench.ports["lidar"]), bench.drone():
-        result = CliRunner().invoke(app, ["preflight", str(bench.config), "--for", str(LISTEN_S), "--no-motion"])
+        command = ["preflight", str(bench.config), "--for", str(LISTEN_S), "--no-motion"]
+        result = undisturbed(lambda: CliRunner().invoke(app, command))
     assert result.exit_code == 0, result.output
     assert "GO: " in result.output
     names = ("lidar rate", "lidar losses", "servo replies", "camera_vehicle size", "autopilot parameters", "disk")

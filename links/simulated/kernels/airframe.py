@@ -8,8 +8,8 @@ The attitude controller sees the *estimated* attitude only; truth moves the airf
     IMU: R^T (acceleration + g) and turn rate, with bias, white noise and rotor vibration; the gyro with a scale error
 
 Vibration is a sum over the rotors of a tone at the rotation rate (imbalance) and one of half its size at twice the rate
-(two blades), with phases of its own on each axis. The rate goes with the root of the thrust. A stream slower than twice
-these rates contains their aliases.
+(two blades), with phases of its own on each axis, and of broadband noise (airflow, frame). The rate goes with the root
+of the thrust. A stream slower than twice these rates contains their aliases.
 
 Source: ours; the airframe of `links.simulated.kernels.motion.fly` with the estimate in the loop. Biquad: ArduPilot
 libraries/Filter/LowPassFilter2p.cpp (Butterworth), with which it filters what RAW_IMU reports.
@@ -49,8 +49,9 @@ def fly_steps(
 
     state (17,) and estimate (16,: p, v, q, gyro bias, accelerometer bias in the estimator's frame) are updated. command
     (7,): desired acceleration + g in the estimator's frame, yaw, yaw rate, 1: motors run, ground height. wind (n, 3);
-    noise (n, 6) standard normal; limits as of `fly`; imu (17,): gyro bias, accelerometer bias, their white noise per
-    sample, vibration amplitude of gyro and accelerometer, scale error of the gyro (3 each, but one white noise each).
+    noise (n, 6) standard normal; limits as of `fly`; imu (19,): gyro bias, accelerometer bias, their white noise per
+    sample, vibration amplitude of gyro and accelerometer, scale error of the gyro (3 each, but one white noise each),
+    and broadband vibration per sample of gyro and accelerometer.
     rotors (4, 8): phase, rate [Hz], phase offset of the six axes. filters (6, 2) and coefficients (5,): the low-pass of
     the reported samples. rows (n, 17), samples (n, 6), estimates (n, 10) take each step's truth, reported gyro and
     accelerometer, and estimate.
@@ -94,6 +95,8 @@ def fly_steps(
                 shake += np.sin(angle) + 0.5 * np.sin(2 * angle)
             true = state[10 + i] * (1.0 + imu[14 + i]) if i < 3 else force[i - 3]
             white = imu[6] if i < 3 else imu[7]
+            if running:
+                white = np.hypot(white, imu[17] if i < 3 else imu[18])
             raw[i] = true + imu[i] + white * noise[k, i] + (imu[8 + i] * shake if running else 0.0)
             moved[i] += raw[i] * STEP_S
             samples[k, i] = low_pass_sample(raw[i], filters[i], coefficients)

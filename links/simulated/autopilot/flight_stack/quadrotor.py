@@ -19,6 +19,7 @@ from links.simulated.kernels.airframe import (
     STATE_SIZE,
     THRUST,
     fly_steps,
+    low_pass_sample,
 )
 from links.simulated.kernels.motion import GRAVITY_MPS2, STEP_S
 from links.simulated.world.flown_motion import FlownMotion
@@ -81,7 +82,7 @@ class Quadrotor:
         further = np.random.default_rng([seed, 44])
         rotor_hz = settings.imu.rotor_hz or further.uniform(*ROTOR_HZ)
         scale = settings.imu.gyro_scale * further.standard_normal(3)
-        self._imu = np.concatenate([imu_errors(settings.imu, rotor_hz, rng), scale])
+        self._imu = np.concatenate([imu_errors(settings.imu, rotor_hz, rng), scale, broadband(settings.imu)])
         self._coefficients = butterworth(settings.imu.filter_hz, 1 / STEP_S)
         self._filters = np.zeros((6, 2))
         rates_hz = rotor_hz * np.array(SPREAD)
@@ -143,7 +144,7 @@ class Quadrotor:
 def imu_errors(s: ImuSettings, rotor_hz: float, rng: np.random.Generator) -> Array64:
     """Biases (6), white noise of gyro and accelerometer, vibration amplitudes (6) for `fly_steps`.
 
-    The vibration settings are RMS values after the low-pass; a rotor's tone and its harmonic add
+    The vibration settings are RMS values after the low-pass. A rotor's tone and its harmonic add
     (|H(f)|^2 + |H(2 f)|^2 / 4) / 2 to the variance per squared amplitude.
     """
     h1, h2 = gain(s.filter_hz, rotor_hz, 1 / STEP_S), gain(s.filter_hz, 2 * rotor_hz, 1 / STEP_S)
@@ -151,8 +152,17 @@ def imu_errors(s: ImuSettings, rotor_hz: float, rng: np.random.Generator) -> Arr
     gyro_bias = math.radians(s.gyro_bias_degps) * rng.standard_normal(3)
     accelerometer_bias = s.accelerometer_bias_mps2 * rng.standard_normal(3)
     white = [math.radians(s.gyro_white_degps), s.accelerometer_white_mps2]
-    shake = [math.radians(s.vibration_degps) / one] * 3 + [s.vibration_mps2 / one] * 3
+    share = math.sqrt(s.tones) / one
+    shake = [share * math.radians(s.vibration_degps)] * 3 + [share * s.vibration_mps2] * 3
     return np.concatenate([gyro_bias, accelerometer_bias, white, shake])
+
+
+def broadband(s: ImuSettings) -> Array64:
+    """(2,) broadband vibration of a sample before the low-pass: gyro [rad/s], accelerometer [m/s^2]."""
+    rms = np.array([math.radians(s.vibration_degps), s.vibration_mps2])
+    memory, coefficients = np.zeros(2), butterworth(s.filter_hz, 1 / STEP_S)
+    response = [low_pass_sample(float(k == 0), memory, coefficients) for k in range(round(1 / STEP_S))]
+    return rms * math.sqrt((1.0 - s.tones) / sum(h * h for h in response))
 
 
 def butterworth(cutoff_hz: float, rate_hz: float) -> Array64:

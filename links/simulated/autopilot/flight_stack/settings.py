@@ -21,6 +21,8 @@ class ImuSettings(StrictModel):
     Biases are those left by the calibration, which ArduPilot subtracts before its EKF and before RAW_IMU; for the gyro
     at each boot (AP_InertialSensor_Backend::_rotate_and_correct_gyro). The two gyros of a real flight (Pixhawk, 330 s)
     differ by 0.2 deg/s in the mean, and by 1.6, 3.9 and 2.2 % in the scale of x, y and z. MPU-6000: scale within 3 %.
+    Its accelerometers have 0.4 to 1.0 m/s^2 RMS above 2.5 Hz, broadband without lines. Half of the simulated vibration
+    is tones, because their aliases are the harder case.
     """
 
     gyro_bias_degps: float = Field(default=0.15, ge=0)  # one sigma, constant in a run
@@ -30,6 +32,7 @@ class ImuSettings(StrictModel):
     accelerometer_white_mps2: float = Field(default=0.03, ge=0)  # per 400 Hz sample
     vibration_mps2: float = Field(default=0.3, ge=0, le=30)  # RMS per axis in hover, of the reported accelerometer
     vibration_degps: float = Field(default=0.5, ge=0, le=100)  # the same of the gyro
+    tones: float = Field(default=0.5, ge=0, le=1)  # share of the variance by tones, else broadband
     rotor_hz: float | None = Field(default=None, ge=20, le=180)  # in hover; None: drawn by the seed from 65 to 125
     filter_hz: float = Field(default=20.0, ge=5, le=190)
 

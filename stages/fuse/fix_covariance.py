@@ -5,6 +5,7 @@ Source: ours; the shares: stages/fuse/settings.py.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,12 +30,14 @@ class FixCovariance:
 
 
 def fix_covariance(fix: DroneFix, vehicle: VehicleTrajectory, errors: FuseErrors) -> FixCovariance:
-    """Error of a LiDAR position, with that of the vehicle's extrapolated pose."""
+    """Error of a LiDAR position, with that of the vehicle's tilt and of its extrapolated pose."""
     whole = errors.fix_variance * fix.covariance_m2
     bias = errors.fix_bias_share * whole
     if fix.bias_covariance_m2 is not None:
         bias = fix.bias_covariance_m2
         whole = bias + errors.fix_variance * (fix.covariance_m2 - bias)
+    tilted = math.radians(errors.vehicle_tilt_deg) * np.cross(np.eye(2, 3), fix.xyz_vehicle_m)  # (2, 3), one sigma
+    whole = whole + tilted.T @ tilted
     R, ahead = vehicle.at(fix.stamp_ns)[0], np.zeros((3, 3))
     if vehicle.known_at(fix.stamp_ns):  # otherwise the vehicle frame serves as the map frame
         ahead = vehicle.extrapolation_covariance_m2(fix.stamp_ns, fix.xyz_vehicle_m)

@@ -1,7 +1,8 @@
 """The vehicle's own odometry, if it has one: T_map_vehicle with covariance, with drift, on /vehicle/odometry.
 
 The pose is that of wheels and a gyro, in the frame of the vehicle at the start of the scenario. It is smooth, and its
-error grows with the distance driven (see `drift`).
+error grows with the distance driven (see `drift`). Without `measures_tilt` the vehicle is reported level; the truth of
+`T_map_vehicle` has its tilt.
 
 Source: ours; recording format in recordings/README.md (/vehicle/odometry).
 """
@@ -16,6 +17,7 @@ from pydantic import Field
 
 from flow.link import Record
 from flow.stage import StrictModel
+from links.simulated.kernels.motion import rotations_z
 from links.simulated.sensors.drift import STEP_S, DriftingEstimate, DriftSettings
 from links.simulated.world.path import Path, TimeSpan
 from links.simulated.world.suspension import SuspendedPath
@@ -43,6 +45,7 @@ class VehicleOdometrySettings(StrictModel):
     latency_s: float = Field(default=0.004, ge=0, le=1)
     jitter_s: float = Field(default=0.001, ge=0, le=1)  # mean of an exponential distribution
     drift: WheelDriftSettings = WheelDriftSettings()
+    measures_tilt: bool = True  # false: wheels alone
     frozen_s: TimeSpan | None = None  # new stamps with the pose of the first time
 
 
@@ -66,6 +69,8 @@ class VehicleOdometry:
             begin_s, end_s = settings.frozen_s
             time_s = np.where((time_s >= begin_s) & (time_s < end_s), begin_s, time_s)
         rotations, self._positions = self._poses(time_s)
+        if not settings.measures_tilt:
+            rotations = rotations_z(np.arctan2(rotations[:, 1, 0], rotations[:, 0, 0]))
         self._quaternions = quaternions_xyzw(rotations)
         self._covariances = estimate.covariances(time_s, rotations)
         self._sent = 0

@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import json
 
+import numpy as np
+
 from flow.link import Record
 from links.preflight.check_result import Level
 from links.vehicle_odometry import VehicleOdometry
-from links.vehicle_odometry.checks import odometry_check
+from links.vehicle_odometry.checks import is_level, odometry_check
+from stages.geometry.frames import rotation_z
+from stages.kernels.geometry.so3 import exp_rotation
+from stages.messages import VehicleMotion
 from tests.links.preflight.observed import BEGIN_NS, observe
 
 
@@ -32,3 +37,13 @@ def test_an_odometry_that_stopped_sending_fails():
     stopped = odometry_check(observe(link, poses, end_ns=later_ns), link)
     assert stopped.level is Level.FAIL
     assert "is its sender still running?" in stopped.sentence
+
+
+def test_an_odometry_without_roll_and_pitch_is_level():
+    def motion(R):
+        return VehicleMotion(stamp_ns=0, xyz_map_m=np.zeros(3), R_map_vehicle=R, covariance=None)
+
+    turned = motion(rotation_z(0.3))
+    assert is_level([turned, motion(np.eye(3))])
+    assert not is_level([turned, motion(exp_rotation(np.array([1e-4, 0.0, 0.0])))])
+    assert not is_level([])

@@ -10,9 +10,13 @@ import numpy as np
 import pytest
 
 from stages.fuse import Fuse
+from stages.fuse.fix_covariance import fix_covariance
 from stages.fuse.map_frame import MapChange, MapFrame
+from stages.fuse.settings import FuseErrors
 from stages.geometry.frames import heading_rad, rotation_z
-from stages.messages import HeadingPrior, MotionStatus, PoseState, VehicleMotion
+from stages.geometry.trajectory import VehicleTrajectory
+from stages.kernels.geometry.so3 import exp_rotation
+from stages.messages import DroneFix, HeadingPrior, MotionStatus, PoseState, VehicleMotion
 from tests.stages.fuse.fuse_inputs import late, outliers, poses_of, without
 from tests.stages.fuse.imu_flights import ImuFlight, ns, seconds
 from tests.stages.fuse.judged import CHI2_95, VEHICLE, Flown, fly, rms
@@ -399,3 +403,15 @@ def test_beyond_its_newest_pose_a_vehicle_may_have_braked_and_turned():
     assert np.allclose(covariance, shift_m**2 * np.eye(3) + yaw_rad**2 * np.outer(across, across))
     later, _, _ = frame.vehicle_covariance_m2(ns(0.48), place)
     assert math.sqrt(later[2, 2]) == pytest.approx(0.5 * 2.0 * 0.4**2 + 6.0 * 0.1)
+
+
+@pytest.mark.parametrize("xyz_m", [(0.0, 0.0, 10.0), (7.0, -2.0, 10.0), (12.0, 0.0, 0.0)])
+def test_a_tilt_of_the_vehicle_is_in_the_error_of_a_position(xyz_m: tuple[float, float, float]):
+    """Against a position that is turned by many random tilts."""
+    rng, tilt_rad = np.random.default_rng(1), math.radians(1.0)
+    fix = DroneFix(stamp_ns=0, xyz_vehicle_m=np.array(xyz_m), covariance_m2=1e-6 * np.eye(3), hits=9)
+    turned = [exp_rotation(tilt_rad * np.array([*rng.standard_normal(2), 0.0])) @ xyz_m for _ in range(4000)]
+    tilted, without = (fix_covariance(fix, VehicleTrajectory(), FuseErrors(vehicle_tilt_deg=t)) for t in (1.0, 0.0))
+    np.testing.assert_allclose(tilted.whole, np.cov(np.array(turned).T), atol=0.06 * (tilt_rad * 12.0) ** 2)
+    np.testing.assert_allclose(without.whole, 0.7e-6 * np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(tilted.bias, without.bias)

@@ -12,6 +12,7 @@ from links.simulated.sensors.drift import STEP_S, DriftingEstimate, DriftSetting
 from links.simulated.sensors.vehicle_odometry import VehicleOdometry, VehicleOdometrySettings
 from links.simulated.world.motion import gauss_markov, interpolate, random_walk, rotations_from_vectors
 from links.simulated.world.path import Path, Waypoint
+from links.simulated.world.suspension import SuspendedPath, SuspensionSettings
 from stages.geometry.frames import (
     quaternions_xyzw,
     rotation_from_quaternion_xyzw,
@@ -183,3 +184,17 @@ def test_a_frozen_odometry_repeats_its_pose_with_new_stamps_and_then_has_moved_o
     np.testing.assert_allclose(
         at_m + odometry.drift_m(9.0), odometry.T_map_vehicle(np.array([START_NS + 9 * 10**9]))[1][0]
     )
+
+
+def test_wheels_report_a_level_vehicle_and_its_true_place() -> None:
+    path = SuspendedPath(DRIVE, SuspensionSettings(), 20.0, 1)
+    both = [
+        VehicleOdometry(VehicleOdometrySettings(measures_tilt=tilt), path, START_NS, 10.0, 1) for tilt in (True, False)
+    ]
+    poses = [[json.loads(r.data) for r in odometry.records(START_NS + 11_000_000_000)] for odometry in both]
+    tilts, level = (np.array([pose["quaternion_xyzw"][:2] for pose in sent]) for sent in poses)
+    assert np.degrees(2 * np.abs(tilts).max()) > 0.3
+    assert np.abs(level).max() < 1e-9
+    assert [pose["xyz_m"] for pose in poses[0]] == [pose["xyz_m"] for pose in poses[1]]
+    for true in zip(*(odometry.T_map_vehicle(np.array([START_NS + 5_000_000_000])) for odometry in both), strict=True):
+        np.testing.assert_array_equal(*true)

@@ -3,22 +3,19 @@
 Samples are averaged over blocks of `block_s`, and a parabola is fitted to the blocks of the last `window_s`; with n
 blocks of duration T and squared residuals q, the density is the root of q T / (n - 3). Blocks, because the noise is not
 white: an autopilot filters its samples (20 Hz), and the rotors shake it at lower frequencies. What counts is the
-density at the frequencies that pass an integration. In the log of a flight (Pixhawk, 50 Hz) the residuals of single
-samples about a curve of 0.22 s, which contain frequencies above some 6 Hz, state half of it: 0.07 to 0.09 instead of
-0.13 to 0.15 m/s^2/sqrt(Hz) at 3 to 8 Hz.
+density at the frequencies that pass an integration: a tone of the rotors above 10 Hz averages out. In the log of a
+flight (Pixhawk, 50 Hz) the residuals of single samples about a curve of 0.22 s, which contain frequencies above some
+6 Hz, state half of it: 0.07 to 0.09 instead of 0.13 to 0.15 m/s^2/sqrt(Hz) at 3 to 8 Hz.
 
-A window of 0.44 s (twice `noise_window_s`) lets motion below some 3 Hz pass into the parabola: manoeuvres are not
-noise. The variance is averaged with the time constant `average_s`; one window counts at most as LARGEST times the
-average, because a gust or a touch-down is not vibration.
+A window of 0.44 s lets motion below some 3 Hz pass into the parabola: manoeuvres are not noise. The variance is
+averaged with the time constant `average_s`; one window counts at most as LARGEST times the average, because a gust or a
+touch-down is not vibration.
 
-Of several densities the largest counts (inertial_motion.py):
-
-- Single samples contain what blocks average out, tones of the rotors above 10 Hz, which thrust may move to any alias.
-- Blocks of 0.1 and 0.2 s, in windows of 0.9 and 1.8 s, contain frequencies down to 1.5 and 0.75 Hz. A rotor that turns
-  near a multiple of the sampling rate is aliased to there. Compared with LiDAR positions this would be motion. Only the
-  specific force is judged so: it is thrust along z and drag across, and changes little at these frequencies, while the
-  turn rate does. In the log above its density is 0.11 to 0.21 m/s^2/sqrt(Hz) at 0.75 to 2.5 Hz and 0.11 to 0.24 at 2.5
-  to 5 Hz.
+Of several densities of the specific force the largest counts (inertial_motion.py): blocks of 0.1 and 0.2 s, in windows
+of 0.9 and 1.8 s, contain frequencies down to 1.5 and 0.75 Hz. A rotor that turns near a multiple of the sampling rate
+is aliased to there. Compared with LiDAR positions this would be motion. Only the specific force is judged so: it is
+thrust along z and drag across, and changes little at these frequencies, while the turn rate does. In the log above its
+density is 0.11 to 0.21 m/s^2/sqrt(Hz) at 0.75 to 2.5 Hz and 0.11 to 0.24 at 2.5 to 5 Hz.
 
 A tone that is aliased to below 0.75 Hz is not seen, and acts as a bias.
 
@@ -43,7 +40,7 @@ class NoiseDensity:
     """Noise density of each axis of two vectors that are sampled together."""
 
     def __init__(self, block_s: float, window_s: float, average_s: float) -> None:
-        """`block_s`: least duration of a block; 0: each sample is one."""
+        """`block_s`: least duration of a block."""
         self._block_s, self._window_ns, self._average_s = block_s, round(1e9 * window_s), average_s
         self._sum, self._count = np.zeros(6), 0  # of the open block
         self._ended_ns: int | None = None  # end of the last block

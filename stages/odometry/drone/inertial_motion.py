@@ -45,8 +45,8 @@ class InertialMotionSettings(Settings):
     """Settings of `InertialMotion`."""
 
     longest_gap_s: float = Field(0.25, gt=0, le=1)  # between two samples of a segment; 10 Hz with one sample lost
-    noise_window_s: float = Field(0.22, gt=0, le=2)  # of the local fit to samples; twice that to blocks
-    noise_block_s: float = Field(0.05, gt=0, le=1)  # samples are averaged over: frequencies above 10 Hz
+    noise_window_s: float = Field(0.44, gt=0, le=2)  # of the local fit to blocks; k times that for SLOW_BLOCKS
+    noise_block_s: float = Field(0.05, gt=0, le=1)  # a block; tones above some 10 Hz average out
     noise_average_s: float = Field(2.0, gt=0, le=60)
     initial_force_mps2: float = Field(0.35, gt=0)  # noise of a sample, until it is estimated
     initial_rate_radps: float = Field(0.015, gt=0)
@@ -65,12 +65,8 @@ class InertialMotion(Stage[InertialMotionSettings]):
         super().__init__(settings, **values)
         self._autopilot = AutopilotEstimate(self.settings.autopilot_age_s)
         s = self.settings
-        self._noise = (
-            NoiseDensity(0.0, s.noise_window_s, s.noise_average_s),
-            NoiseDensity(s.noise_block_s, 2 * s.noise_window_s, s.noise_average_s),
-        )
-        self._slow_noise = tuple(
-            NoiseDensity(k * s.noise_block_s, 2 * k * s.noise_window_s, k * s.noise_average_s) for k in SLOW_BLOCKS
+        self._noise, *self._slow_noise = (
+            NoiseDensity(k * s.noise_block_s, k * s.noise_window_s, k * s.noise_average_s) for k in (1, *SLOW_BLOCKS)
         )
         self._false = FalseSamples()
         self._magnetic = MagneticGyroBias()
@@ -136,7 +132,7 @@ class InertialMotion(Stage[InertialMotionSettings]):
         )
 
     def _begin(self, imu: DroneImu) -> None:
-        for noise in (*self._noise, *self._slow_noise):
+        for noise in (self._noise, *self._slow_noise):
             noise.new_segment()
         self._false.new_segment()
         self._magnetic.restart()
@@ -149,17 +145,17 @@ class InertialMotion(Stage[InertialMotionSettings]):
         return self._false.add(imu.stamp_ns, imu.acceleration_drone_mps2, imu.angular_velocity_drone_radps)
 
     def _add(self, imu: DroneImu) -> None:
-        for noise in (*self._noise, *self._slow_noise):
+        for noise in (self._noise, *self._slow_noise):
             noise.add(imu.stamp_ns, imu.acceleration_drone_mps2, imu.angular_velocity_drone_radps)
         self._last = imu
 
     def _noise_densities(self, dt_s: float, rate: Array64) -> Array64:
         """Noise densities (2, 3) of specific force and rate over an interval."""
         s = self.settings
-        known = [noise.density for noise in self._noise if noise.density is not None]
-        if not known:
-            known = [np.outer([s.initial_force_mps2, s.initial_rate_radps], np.full(3, math.sqrt(dt_s)))]
-        densities = np.maximum.reduce([*known, np.outer([s.least_force_noise, s.least_rate_noise], np.ones(3))])
+        known = self._noise.density
+        if known is None:
+            known = np.outer([s.initial_force_mps2, s.initial_rate_radps], np.full(3, math.sqrt(dt_s)))
+        densities = np.maximum(known, np.outer([s.least_force_noise, s.least_rate_noise], np.ones(3)))
         for noise in self._slow_noise:
             if noise.density is not None:
                 densities[0] = np.maximum(densities[0], noise.density[0])

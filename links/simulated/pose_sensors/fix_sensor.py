@@ -39,7 +39,7 @@ class FixSensorSettings(StrictModel):
     sigma_per_m: float = Field(default=0.0025, ge=0)  # of the varying error, per axis and metre of range
     bias_per_m: float = Field(default=0.002, ge=0)  # one sigma of the constant error
     correlation_s: float = Field(default=0.3, gt=0)
-    variance_share: float = Field(default=0.7, gt=0, le=1)  # true variance of the varying error over the reported one
+    variance_share: float = Field(default=0.7, gt=0, le=4)  # true variance of the varying error over the reported one
     velocity_mps: float = Field(default=0.1, ge=0)  # one sigma of the reported velocity
     detection: float = Field(default=0.97, gt=0, le=1)  # probability of each fix
     of_other_s: TimeSpan | None = None  # the fixes are those of the first other drone

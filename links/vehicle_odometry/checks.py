@@ -32,7 +32,7 @@ class VehicleOdometryChecks(LinkChecks):
         assert isinstance(source.link, VehicleOdometry)
         yield odometry_check(source, source.link)
         if is_level(observations.all(VehicleMotion)):
-            advice = "for a vehicle that drives set fuse.errors.vehicle_tilt_deg, 0.5 to 1"
+            advice = "for a vehicle that drives set fuse.errors.vehicle_tilt_deg, 0.5 for a car"
             yield warning(f"{source.name} tilt", f"it reports no roll and pitch: {advice}")
 
 

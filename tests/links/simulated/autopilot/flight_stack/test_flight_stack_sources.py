@@ -25,7 +25,7 @@ def test_on_gps_it_holds_within_the_error_of_the_gps() -> None:
 def test_after_the_switch_it_hovers_on_what_it_is_sent(kind: str, sets: str) -> None:
     host = Host(16.0, kind=kind, source_sets=["gps", sets])
     host.run(16.0)
-    assert host.scatter_m(8.0) < 0.25
+    assert host.scatter_m(8.0) < 0.35  # broadband vibration moves the estimated velocity
     assert "EKF failsafe" not in host.events()
     estimate = host.stack.ekf.output()
     np.testing.assert_allclose(estimate[0:2], host.stack.quadrotor.state[0:2], atol=0.2)  # map is the world here
@@ -105,7 +105,7 @@ def test_without_poses_it_lands_after_the_timeout_and_one_second(kind: str, afte
     host.run(22.0)
     failsafe_s = next(event.time_s for event in host.stack.events if str(event) == "EKF failsafe")
     assert failsafe_s == pytest.approx(8.0 + after_s, abs=0.5)
-    assert host.stack.quadrotor.state[2] < 6.0
+    assert host.stack.quadrotor.state[2] < 7.0  # descends from 10 m
     assert host.received("HEARTBEAT")[-1].custom_mode == 9
 
 

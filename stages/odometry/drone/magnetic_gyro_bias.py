@@ -6,14 +6,14 @@ drone's yaw alone. Over a window the field, rotated to the axes of the window's 
 
     phi(t) = (u . b) t + change of the compass error,   u: the vertical, b: the bias of the gyroscope, drone axes
 
-The slope of phi is a measurement of u . b. Its sigma is the larger of two:
+The slope of phi is a measurement of u . b. Its variance is the larger of two:
 
-- The changes of the compass error are a random walk of the heading, whose density q is measured in the window: about
-  its straight line a random walk has the variance q T / 15. An error that only fluctuates, as by gusts and white noise,
-  is stated too large by this. q is the mean of the last windows, and at least that of this one. A random walk has few
-  degrees of freedom in a window: with n windows the variance is larger by (n + 1) / n.
-- An error that drifts for many seconds is a straight line in one window: the standard deviation of the last slopes.
-  FIRST_SLOPE counts as FIRST_COUNTS slopes: the autopilot's vertical moves by 1 deg in a window, at a dip of 60 deg.
+- That of a random walk of the compass error, whose density q is measured in the window: about its straight line a
+  random walk has the variance q T / 15. An error that only fluctuates, as by gusts and white noise, is stated too large
+  by this. q is the mean of the last windows, and at least that of this one. A random walk has few degrees of freedom in
+  a window: with n windows the variance is larger by (n + 1) / n.
+- That of the last slopes, because an error that drifts for many seconds is a straight line in one window. FIRST_SLOPE
+  counts as FIRST_COUNTS slopes: the autopilot's vertical moves by 1 deg in a window, at a dip of 60 deg.
 
 A drift that is steady for all SLOPES windows (64 s) is taken for a bias.
 
@@ -45,7 +45,7 @@ from stages.sums import sum_in_order
 WINDOW_S, BLOCKS = 8.0, 8  # a window, and the parts of it whose means the line is fitted to
 WALKS, SLOPES = 4, 8  # remembered windows
 FIRST_SLOPE, FIRST_COUNTS = math.radians(1.0) * math.tan(math.radians(60.0)) / WINDOW_S, 2.0  # [rad/s]
-LEAST_FIELD_UT = 5.0  # horizontal; more than 10 everywhere but near the magnetic poles
+LEAST_FIELD_UT = 5.0  # horizontal; more than 10 except near the magnetic poles (World Magnetic Model)
 MOST_TURN_RAD = math.radians(10.0)  # of the drone in a window
 IRON = math.radians(10.0)  # change of the compass error in a turn [rad/rad], of the log above
 LEAST_WALK = math.radians(0.15)  # of the compass error [rad/sqrt(s)]

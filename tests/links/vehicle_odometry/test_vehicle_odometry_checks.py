@@ -8,8 +8,9 @@ import numpy as np
 
 from flow.link import Record
 from links.preflight.check_result import Level
+from links.preflight.observations import Observations
 from links.vehicle_odometry import VehicleOdometry
-from links.vehicle_odometry.checks import is_level, odometry_check
+from links.vehicle_odometry.checks import VehicleOdometryChecks, is_level, odometry_check
 from stages.geometry.frames import rotation_z
 from stages.kernels.geometry.so3 import exp_rotation
 from stages.messages import VehicleMotion
@@ -47,3 +48,9 @@ def test_an_odometry_without_roll_and_pitch_is_level():
     assert is_level([turned, motion(np.eye(3))])
     assert not is_level([turned, motion(exp_rotation(np.array([1e-4, 0.0, 0.0])))])
     assert not is_level([])
+    link = VehicleOdometry(port=14600)
+    source = observe(link, [])
+    for motions, warned in (([turned], True), ([], False)):
+        seen = Observations(sources=(source,), messages={VehicleMotion: motions}, live=True)
+        sentences = [result.sentence for result in VehicleOdometryChecks().check_source(source, seen)]
+        assert any("fuse.errors.vehicle_tilt_deg" in sentence for sentence in sentences) == warned

@@ -129,7 +129,7 @@ def test_without_a_field_or_with_few_samples_of_it_nothing_is_measured():
     assert not any(stage.add(0.02, np.zeros(3), None, UP) for _ in range(500))
     assert not any(stage.add(0.02, np.zeros(3), FIELD, None) for _ in range(500))
     assert not any(
-        stage.add(0.02, np.zeros(3), np.array([0.0, 0.0, 40.0]), UP) for _ in range(500)
+        stage.add(0.02, np.zeros(3), np.array([0.0, 0.0, 40.0 + 0.01 * k]), UP) for k in range(500)
     )  # no horizontal field
 
 

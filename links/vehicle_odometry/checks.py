@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 from flow.graph import Graph
 from links.preflight.check_result import CheckResult, fail, ok, warning
 from links.preflight.link_checks import LinkChecks, declares
 from links.preflight.observations import Observations, ObservedSource
 from links.vehicle_odometry.odometry import VehicleOdometry
+from stages.geometry.trajectory import is_level
 from stages.messages import VehicleMotion
 
 OLD_MS = 200.0  # age of a pose
 ODOMETRY_HZ = 5.0
-LEVEL = 1e-6  # roll and pitch [rad] below any measurement
 ODOMETRY_SILENT_S = 1.0  # a sender that is silent for longer has stopped
 
 
@@ -31,14 +31,10 @@ class VehicleOdometryChecks(LinkChecks):
         """See LinkChecks."""
         assert isinstance(source.link, VehicleOdometry)
         yield odometry_check(source, source.link)
-        if is_level(observations.all(VehicleMotion)):
-            advice = "for a vehicle that drives set fuse.errors.vehicle_tilt_deg, 0.5 for a car"
-            yield warning(f"{source.name} tilt", f"it reports no roll and pitch: {advice}")
-
-
-def is_level(motions: Sequence[VehicleMotion]) -> bool:
-    """Whether there are motions, and the vertical of each is exactly that of the map."""
-    return bool(motions) and all(abs(motion.R_map_vehicle[2, :2]).max() < LEVEL for motion in motions)
+        motions = observations.all(VehicleMotion)
+        if motions and all(is_level(motion.R_map_vehicle) for motion in motions):
+            assumed = "assumed are those of a car, by its acceleration (fuse.errors.vehicle_tilt_deg_per_mps2)"
+            yield ok(f"{source.name} tilt", f"it reports no roll and pitch: {assumed}")
 
 
 def odometry_check(source: ObservedSource, link: VehicleOdometry) -> CheckResult:

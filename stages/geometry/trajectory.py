@@ -33,6 +33,13 @@ TOGETHER_NS = 10_000_000  # shortest interval that gives a speed
 RECENT_NS = 700_000_000  # the motion counts as known this long after a pose; visual odometry delivers 5 poses a second
 RESTART_NS = 2_000_000_000  # during a gap this long an odometry may restart unnoticed
 FURTHEST_NS = round(1e9 * EXTRAPOLATION_S)  # extrapolation beyond the newest pose
+RECENT_MOTION_NS = 250_000_000  # interval of the two velocities whose difference is the acceleration
+LEVEL = 1e-6  # roll and pitch [rad] below any measurement
+
+
+def is_level(R_map_vehicle: Array64) -> bool:
+    """Whether a rotation (3, 3) has no roll and pitch at all: the odometry does not measure them."""
+    return bool(np.abs(R_map_vehicle[2, :2]).max() < LEVEL)
 
 
 class VehicleTrajectory:
@@ -57,6 +64,11 @@ class VehicleTrajectory:
     def known_at(self, stamp_ns: int) -> bool:
         """Whether the newest pose is recent enough (RECENT_NS) for the motion to be known."""
         return bool(self._poses) and stamp_ns - self._poses[-1][0] < RECENT_NS
+
+    @property
+    def is_level(self) -> bool:
+        """Whether the newest pose has no roll and pitch at all, as where wheels alone measure."""
+        return bool(self._poses) and is_level(self._poses[-1][1])
 
     @property
     def newest_ns(self) -> int | None:
@@ -194,6 +206,15 @@ class VehicleTrajectory:
     def velocity_mps(self, stamp_ns: int) -> Array64:
         """The vehicle's velocity (3,) in frame map."""
         return (self.at(stamp_ns + STEP_NS)[1] - self.at(stamp_ns)[1]) / (STEP_NS * 1e-9)
+
+    def recent_motion(self, stamp_ns: int) -> tuple[Array64, Array64]:
+        """Mean velocity (3,) and acceleration (3,) of the last 0.5 s, vehicle axes; zero where no pose gives them."""
+        if not self._poses or stamp_ns - 2 * RECENT_MOTION_NS < max(self._poses[0][0], self.frame_start_ns):
+            return np.zeros(3), np.zeros(3)
+        R, now = self.at(stamp_ns)
+        before, first = (self.at(stamp_ns - k * RECENT_MOTION_NS)[1] for k in (1, 2))
+        seconds = RECENT_MOTION_NS * 1e-9
+        return R.T @ (now - first) / (2.0 * seconds), R.T @ (now - 2.0 * before + first) / seconds**2
 
     def constant_velocity(self, stamp_ns: int) -> tuple[Array64, Array64]:
         """R and t extrapolated with the newest rates, without the horizon that `at` has."""

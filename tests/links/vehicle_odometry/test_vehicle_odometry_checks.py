@@ -10,7 +10,7 @@ from flow.link import Record
 from links.preflight.check_result import Level
 from links.preflight.observations import Observations
 from links.vehicle_odometry import VehicleOdometry
-from links.vehicle_odometry.checks import VehicleOdometryChecks, is_level, odometry_check
+from links.vehicle_odometry.checks import VehicleOdometryChecks, odometry_check
 from stages.geometry.frames import rotation_z
 from stages.kernels.geometry.so3 import exp_rotation
 from stages.messages import VehicleMotion
@@ -40,17 +40,14 @@ def test_an_odometry_that_stopped_sending_fails():
     assert "is its sender still running?" in stopped.sentence
 
 
-def test_an_odometry_without_roll_and_pitch_is_level():
+def test_an_odometry_without_roll_and_pitch_is_reported():
     def motion(R):
         return VehicleMotion(stamp_ns=0, xyz_map_m=np.zeros(3), R_map_vehicle=R, covariance=None)
 
-    turned = motion(rotation_z(0.3))
-    assert is_level([turned, motion(np.eye(3))])
-    assert not is_level([turned, motion(exp_rotation(np.array([1e-4, 0.0, 0.0])))])
-    assert not is_level([])
+    turned, tilted = motion(rotation_z(0.3)), motion(exp_rotation(np.array([1e-4, 0.0, 0.0])))
     link = VehicleOdometry(port=14600)
     source = observe(link, [])
-    for motions, warned in (([turned], True), ([], False)):
+    for motions, level in (([turned, motion(np.eye(3))], True), ([turned, tilted], False), ([], False)):
         seen = Observations(sources=(source,), messages={VehicleMotion: motions}, live=True)
         sentences = [result.sentence for result in VehicleOdometryChecks().check_source(source, seen)]
-        assert any("fuse.errors.vehicle_tilt_deg" in sentence for sentence in sentences) == warned
+        assert any("fuse.errors.vehicle_tilt_deg_per_mps2" in sentence for sentence in sentences) == level

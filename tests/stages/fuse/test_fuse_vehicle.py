@@ -13,7 +13,7 @@ from stages.fuse import Fuse
 from stages.fuse.fix_covariance import fix_covariance
 from stages.fuse.map_frame import MapChange, MapFrame
 from stages.fuse.settings import FuseErrors
-from stages.geometry.frames import heading_rad, rotation_z
+from stages.geometry.frames import Array64, heading_rad, rotation_z
 from stages.geometry.trajectory import VehicleTrajectory
 from stages.kernels.geometry.so3 import exp_rotation
 from stages.messages import DroneFix, HeadingPrior, MotionStatus, PoseState, VehicleMotion
@@ -405,13 +405,28 @@ def test_beyond_its_newest_pose_a_vehicle_may_have_braked_and_turned():
     assert math.sqrt(later[2, 2]) == pytest.approx(0.5 * 2.0 * 0.4**2 + 6.0 * 0.1)
 
 
-@pytest.mark.parametrize("xyz_m", [(0.0, 0.0, 10.0), (7.0, -2.0, 10.0), (12.0, 0.0, 0.0)])
-def test_a_tilt_of_the_vehicle_is_in_the_error_of_a_position(xyz_m: tuple[float, float, float]):
-    """Against a position that is turned by many random tilts."""
-    rng, tilt_rad = np.random.default_rng(1), math.radians(1.0)
-    fix = DroneFix(stamp_ns=0, xyz_vehicle_m=np.array(xyz_m), covariance_m2=1e-6 * np.eye(3), hits=9)
-    turned = [exp_rotation(tilt_rad * np.array([*rng.standard_normal(2), 0.0])) @ xyz_m for _ in range(4000)]
-    tilted, without = (fix_covariance(fix, VehicleTrajectory(), FuseErrors(vehicle_tilt_deg=t)) for t in (1.0, 0.0))
-    np.testing.assert_allclose(tilted.whole, np.cov(np.array(turned).T), atol=0.06 * (tilt_rad * 12.0) ** 2)
-    np.testing.assert_allclose(without.whole, 0.7e-6 * np.eye(3), atol=1e-12)
-    np.testing.assert_allclose(tilted.bias, without.bias)
+def braking(R_tilt: Array64) -> VehicleTrajectory:
+    """A vehicle with this tilt in its odometry brakes by 4 m/s2 and is pushed to its left by 2 m/s2, at 4 m/s in the end."""
+    vehicle = VehicleTrajectory(joined=False)
+    for t in np.arange(0.0, 1.01, 0.02):
+        place = np.array([8.0 * t - 2.0 * t**2, t**2, 0.0])
+        vehicle.add(VehicleMotion(stamp_ns=ns(t), xyz_map_m=place, R_map_vehicle=R_tilt, covariance=None))
+    return vehicle
+
+
+@pytest.mark.parametrize("xyz_m", np.array([(0.0, 0.0, 10.0), (7.0, -2.0, 10.0), (12.0, 0.0, 0.0)]))
+def test_the_tilt_of_a_vehicle_that_its_odometry_does_not_measure_is_in_the_error_of_a_position(xyz_m: Array64):
+    """Against a position that is turned by many random tilts: 1 deg about x, 2 deg about y, and 0.4 deg about both."""
+    rng, sigmas_rad = np.random.default_rng(1), np.radians([math.hypot(1.0, 0.4), math.hypot(2.0, 0.4), 0.0])
+    fix = DroneFix(stamp_ns=ns(1.0), xyz_vehicle_m=xyz_m, covariance_m2=1e-6 * np.eye(3), hits=9)
+    turned = [exp_rotation(sigmas_rad * rng.standard_normal(3)) @ xyz_m for _ in range(4000)]
+    level, measured = braking(np.eye(3)), braking(exp_rotation(np.array([1e-3, 0.0, 0.0])))
+    errors, none = (FuseErrors(vehicle_tilt_deg=0.4 * k, vehicle_tilt_deg_per_mps2=0.5 * k) for k in (1, 0))
+    tilted = fix_covariance(fix, level, errors)
+    np.testing.assert_allclose(tilted.whole, np.cov(np.array(turned).T), atol=0.06 * (sigmas_rad[1] * 12.0) ** 2)
+    parked = VehicleTrajectory(joined=False)
+    parked.add(VehicleMotion(stamp_ns=ns(0.0), xyz_map_m=np.zeros(3), R_map_vehicle=np.eye(3), covariance=None))
+    for vehicle, assumed in ((level, none), (measured, errors), (parked, errors)):
+        without = fix_covariance(fix, vehicle, assumed)
+        np.testing.assert_allclose(without.white, 0.75 * 0.7e-6 * np.eye(3), atol=1e-12)
+        np.testing.assert_allclose(tilted.bias, without.bias, atol=1e-12)

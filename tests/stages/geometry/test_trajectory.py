@@ -277,6 +277,29 @@ def test_the_vehicles_velocity_is_the_derivative_of_its_position():
     np.testing.assert_array_equal(trail().velocity_mps(START_NS), np.zeros(3))
 
 
+@pytest.mark.parametrize("speed_mps", [0.0, 8.0])
+def test_the_recent_motion_of_the_vehicle_is_in_its_own_axes(speed_mps: float):
+    """It drives towards -y of map, brakes by 2 m/s2 and is pushed to its left by 1 m/s2, from 0.6 s on."""
+    made, R = VehicleTrajectory(joined=False), rotation_z(-np.pi / 2)
+    for k in range(61):
+        t, braked = 0.02 * k, max(0.02 * k - 0.6, 0.0) ** 2 / 2
+        made.add(motion(20 * k * MS, R @ [speed_mps * t - 2.0 * braked, braked, 0.0], R))
+    for at_ms, speed_lost, acceleration in ((600, 0.0, 0.0), (1200, 0.35, 1.0)):
+        velocity, changed = made.recent_motion(START_NS + at_ms * MS)
+        np.testing.assert_allclose(velocity, (speed_mps - 2.0 * speed_lost, speed_lost, 0.0), atol=0.001)
+        np.testing.assert_allclose(changed, (-2.0 * acceleration, acceleration, 0.0), atol=0.01)
+
+
+def test_the_recent_motion_is_zero_before_the_first_pose_and_has_no_jump_of_the_start_frame():
+    assert not np.any(VehicleTrajectory().recent_motion(START_NS))
+    made = VehicleTrajectory(joined=False)
+    for k in range(60):
+        made.add(motion(20 * k * MS, (0.1 * k + (3 if k >= 30 else 0), 0, 0)))  # 5 m/s
+        velocity, acceleration = made.recent_motion(START_NS + 20 * k * MS)
+        assert velocity[0] == pytest.approx(0.0 if 20 * k < 500 or 32 <= k < 55 else 5.0)
+        np.testing.assert_allclose(acceleration, np.zeros(3), atol=1e-9)
+
+
 def test_relative_velocity_contains_the_vehicles_translation_and_rotation():
     """Relative velocity: R^T (v - v_vehicle) - w x p, here w about z and p ahead."""
     rate_radps, drives = 0.5, np.array([4.0, 0.0, 0.0])

@@ -123,12 +123,12 @@ def _client(workers: Workers, tasks: int) -> Generator[Any, None, None]:
     settings = {"distributed.scheduler.allowed-failures": LOST_WORKERS}
     with config.set(settings), ExitStack() as stack:
         with _interrupts_ignored():  # inherited by the processes that start here
-            no_dashboard: Any = None
             cluster = distributed.LocalCluster(
                 n_workers=min(workers, tasks),
                 threads_per_worker=1,
                 host="127.0.0.1",
-                dashboard_address=no_dashboard,
+                dashboard_address="127.0.0.1:0",  # of its HTTP server, on a free port
+                scheduler_kwargs={"dashboard": False},
                 memory_limit=0,  # no limit
                 silence_logs=logging.CRITICAL,
             )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -134,6 +135,16 @@ def test_an_unknown_scheduler_is_an_error_that_states_what_to_do(monkeypatch: py
     monkeypatch.setattr("flow.jobs.CONNECT_S", 1)
     with pytest.raises(LinkError, match=r"no scheduler at tcp://127.0.0.1:9: .*start one: dask scheduler"):
         run_all(square, [1], "tcp://127.0.0.1:9", lambda shares: None)
+
+
+@pytest.mark.filterwarnings("error")
+def test_another_run_on_this_machine_is_no_warning() -> None:
+    """The other one has the port that a dask scheduler asks for unless told otherwise."""
+    with socket.socket() as other:
+        with suppress(OSError):
+            other.bind(("127.0.0.1", 8787))
+            other.listen()
+        assert [value for _, value in run_all(square, [0, 1], 2, lambda shares: None)] == [0, 1]
 
 
 def test_no_tasks_give_no_results() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from stages.geometry.frames import rotation_z
 from stages.heading import bank_measurements as measure
-from stages.heading.inertial_bank import NEAR_RAD, START_GYRO_BIAS, InertialBank, level, moments, start
+from stages.heading.inertial_bank import MOST, NEAR_RAD, START_GYRO_BIAS, InertialBank, level, moments, start
 from stages.heading.inertial_state import GRAVITY_MPS2, ImuIntervals, InertialState, exp_rotations, predict
 from stages.kernels.geometry.so3 import exp_rotation, log_rotation
 from stages.kernels.heading.preintegration import preintegrate
@@ -150,6 +150,24 @@ def test_hypotheses_that_agree_are_merged_with_their_moments():
     assert len(bank.state) == 1
     assert math.isclose(bank.state.yaw_rad[0], 0.01, abs_tol=1e-3)
     assert bank.state.yaw_variance_rad2[0] > 0.1**2
+
+
+def test_a_trace_of_other_yaws_does_not_widen_the_yaw_that_is_known():
+    """0.0004 round the circle have a standard deviation of 2 deg about it."""
+    bank = start(np.zeros(3), np.eye(3), None, UP, (0.4, math.radians(4.5), 0.9996))
+    bank.tidy()
+    best = int(np.argmax(bank.weight))
+    assert math.isclose(bank.state.yaw_rad[best], 0.4, abs_tol=1e-3)
+    assert math.degrees(math.sqrt(bank.state.yaw_variance_rad2[best])) < 4.51
+    assert math.isclose(bank.weight.sum(), 1.0)
+
+
+def test_of_too_many_hypotheses_those_are_merged_that_lose_least():
+    yaws = np.array([[0.0, 0.0, yaw] + [0.0] * 12 for yaw in 2.0 * math.pi * np.arange(30) / 30])
+    bank = InertialBank(one(sigma=0.05).rows(np.zeros(30, dtype=np.intp)).moved(yaws), np.zeros(30))
+    bank.tidy()
+    assert len(bank.state) == MOST
+    assert math.isclose(bank.weight.sum(), 1.0)
 
 
 def test_a_wide_hypothesis_is_split_without_a_change_of_its_moments():

@@ -311,6 +311,9 @@ class Estimator:
         self._add_vertical(self.heading.stamp_ns)
         self._add_ownership(stamp_ns, z, noise, self.heading.add_position(z, noise))
         self.heading.decide(self.is_own)
+        if self.decided and self.earlier.contradicts(float(self.heading.decision().yaw_rad[0])):
+            self.earlier.forget()
+            self.odometry.restart()
         if self.decided and self.imu.is_current(stamp_ns) and not self.heading.cameras_open:
             self._cameras_confirmed = self.heading.cameras_confirmed
             self.graph.start(self.heading.stamp_ns, self.heading.decision())

@@ -64,6 +64,10 @@ class EarlierFrame:
         """Heading at the newest LiDAR position, once; None: none, or not needed any more."""
         return self._same_frame.heading(decided)
 
+    def contradicts(self, yaw_rad: float) -> bool:
+        """Whether a yaw of the body that is decided at the newest LiDAR position is another one than before."""
+        return self._same_frame.contradicts(yaw_rad)
+
     def odom_yaw(self, stamp_ns: int) -> OdomYaw | None:
         """Yaw of the autopilot's frame if the first LiDAR positions show that the frame is the same."""
         return self._same_frame.odom_yaw(stamp_ns)

@@ -123,6 +123,13 @@ class SameFrame:
         self._used = True
         return self._heading
 
+    def contradicts(self, yaw_rad: float) -> bool:
+        """Whether a yaw of the body that is decided at the newest LiDAR position is another one than the prior's."""
+        if self._newest is None:
+            return False
+        off_rad = abs(math.remainder(yaw_rad - self._newest.yaw_map_rad, 2 * math.pi))
+        return off_rad > NEAR_RAD + 3.0 * self._newest.sigma_rad
+
     def odom_yaw(self, stamp_ns: int) -> OdomYaw | None:
         """Yaw of the autopilot's frame if the first LiDAR positions show that the frame is the same."""
         prior = self._newest

@@ -195,3 +195,16 @@ def test_the_positions_of_another_object_are_judged_anew():
     for _ in range(FIRST):
         run.add(PRIOR, S, PRIOR.xyz_map_m, NO_ERROR, FORWARD, None)
     assert run.odom_yaw(S) is not None
+
+
+@pytest.mark.parametrize(
+    ("off_deg", "other"), [(0.0, False), (24.0, False), (-24.0, False), (27.0, True), (180.0, True)]
+)
+def test_a_decided_yaw_far_from_the_prior_s_contradicts_it(off_deg: float, other: bool):
+    """20 deg, and three sigmas of the prior: 5.2 deg."""
+    run, yaw_rad = SameFrame(SHARE, math.pi), PRIOR.yaw_map_rad + math.radians(off_deg)
+    assert not run.contradicts(yaw_rad)
+    run.add(PRIOR, PRIOR.stamp_ns, PRIOR.xyz_map_m, NO_ERROR, None, None)
+    assert run.contradicts(yaw_rad + 2.0 * math.pi) == other
+    run.add(None, PRIOR.stamp_ns, PRIOR.xyz_map_m, NO_ERROR, None, None)
+    assert not run.contradicts(yaw_rad)

@@ -9,7 +9,7 @@ from links.preflight.check_result import CheckResult, fail, ok, warning
 from links.preflight.link_checks import LinkChecks, declares
 from links.preflight.observations import Observations, ObservedSource
 from links.vehicle_odometry.odometry import VehicleOdometry
-from stages.geometry.trajectory import is_level
+from stages.geometry.trajectory import same_vertical
 from stages.messages import VehicleMotion
 
 OLD_MS = 200.0  # age of a pose
@@ -32,7 +32,7 @@ class VehicleOdometryChecks(LinkChecks):
         assert isinstance(source.link, VehicleOdometry)
         yield odometry_check(source, source.link)
         motions = observations.all(VehicleMotion)
-        if motions and all(is_level(motion.R_map_vehicle) for motion in motions):
+        if motions and all(same_vertical(motion.R_map_vehicle, motions[0].R_map_vehicle) for motion in motions):
             assumed = "assumed are those of a car, by its acceleration (fuse.errors.vehicle_tilt_deg_per_mps2)"
             yield ok(f"{source.name} tilt", f"it reports no roll and pitch: {assumed}")
 

@@ -311,14 +311,20 @@ class Estimator:
         self._add_vertical(self.heading.stamp_ns)
         self._add_ownership(stamp_ns, z, noise, self.heading.add_position(z, noise))
         self.heading.decide(self.is_own)
-        if self.decided and self.earlier.contradicts(float(self.heading.decision().yaw_rad[0])):
+        if self.decided and self._contradicts_earlier(stamp_ns):
             self.earlier.forget()
-            self.odometry.restart()
+            if self._autopilot.odometry(stamp_ns) is None:  # otherwise the axes are measured in this frame
+                self.odometry.restart()
         if self.decided and self.imu.is_current(stamp_ns) and not self.heading.cameras_open:
             self._cameras_confirmed = self.heading.cameras_confirmed
             self.graph.start(self.heading.stamp_ns, self.heading.decision())
             if self.graph.running:
                 self.heading.stop()
+
+    def _contradicts_earlier(self, stamp_ns: int) -> bool:
+        """Whether the decided yaw, at a LiDAR position, is another one than before the interruption."""
+        turn, _ = self.heading.turn(stamp_ns, self.heading.stamp_ns)
+        return self.earlier.contradicts(heading_rad(self.heading.decision().R[0] @ turn.T))
 
     def _add_ownership(self, stamp_ns: int, z: Array64, noise: Array64, evidence: float | None) -> None:
         """Whether the object is the drone; the estimate of another one ends, and nothing is published until it is."""

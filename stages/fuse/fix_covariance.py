@@ -2,7 +2,7 @@
 
 A vehicle tilts on its suspension when it brakes or turns: about x by k a_left, about y by k a_forward, with k =
 `vehicle_tilt_deg_per_mps2`; and on an uneven road, by `vehicle_tilt_deg`. Where its odometry does not measure roll and
-pitch, these are one sigma of either.
+pitch, these are one sigma of either. An acceleration that is not measured yet is that of traffic (USUAL_MANEUVER).
 
 Source: ours; the shares: stages/fuse/settings.py.
 """
@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stages.fuse.settings import FuseErrors
+from stages.geometry.extrapolation import USUAL_MANEUVER
 from stages.geometry.frames import Array64
 from stages.geometry.trajectory import VehicleTrajectory
 from stages.messages import DroneFix
@@ -42,18 +43,24 @@ def fix_covariance(fix: DroneFix, vehicle: VehicleTrajectory, errors: FuseErrors
     if fix.bias_covariance_m2 is not None:
         bias = fix.bias_covariance_m2
         whole = bias + errors.fix_variance * (fix.covariance_m2 - bias)
-    if vehicle.is_level:
-        tilted = np.cross(np.diag(_tilt_rad(vehicle, fix.stamp_ns, errors))[:2], fix.xyz_vehicle_m)  # (2, 3), one sigma
-        whole = whole + tilted.T @ tilted
-    R, ahead = vehicle.at(fix.stamp_ns)[0], np.zeros((3, 3))
+    R, by_vehicle = vehicle.at(fix.stamp_ns)[0], np.zeros((3, 3))
     if vehicle.known_at(fix.stamp_ns):  # otherwise the vehicle frame serves as the map frame
-        ahead = vehicle.extrapolation_covariance_m2(fix.stamp_ns, fix.xyz_vehicle_m)
-    return FixCovariance(R @ (whole - bias + ahead) @ R.T, R @ bias @ R.T)
+        by_vehicle = vehicle.extrapolation_covariance_m2(fix.stamp_ns, fix.xyz_vehicle_m)
+        if not vehicle.measures_tilt:
+            tilted = np.cross(np.diag(_tilt_rad(vehicle, errors))[:2], fix.xyz_vehicle_m)  # (2, 3), one sigma
+            by_vehicle = by_vehicle + tilted.T @ tilted
+    return FixCovariance(R @ (whole - bias + by_vehicle) @ R.T, R @ bias @ R.T)
 
 
-def _tilt_rad(vehicle: VehicleTrajectory, stamp_ns: int, errors: FuseErrors) -> tuple[float, float, float]:
+def _tilt_rad(vehicle: VehicleTrajectory, errors: FuseErrors) -> tuple[float, float, float]:
     """One sigma of the vehicle's rotation about its axes, which its odometry does not measure."""
-    velocity, (forward, left, _) = vehicle.recent_motion(stamp_ns)
-    road_deg = errors.vehicle_tilt_deg * min(math.hypot(*velocity) / DRIVES_MPS, 1.0)
-    about_x, about_y = (math.hypot(road_deg, errors.vehicle_tilt_deg_per_mps2 * a) for a in (left, forward))
-    return math.radians(about_x), math.radians(about_y), 0.0
+    moving = min(vehicle.newest_speed_mps / DRIVES_MPS, 1.0)
+    acceleration = vehicle.newest_acceleration()
+    if acceleration is None:
+        forward2, left2 = np.full(2, (moving * USUAL_MANEUVER.acceleration_mps2) ** 2)
+    else:
+        measured, variance = acceleration
+        forward2, left2 = np.maximum(measured**2 - variance, 0.0)[:2]  # a^2 without what noise adds to it
+    gain, road_deg = errors.vehicle_tilt_deg_per_mps2, moving * errors.vehicle_tilt_deg
+    about_x, about_y = (math.radians(math.sqrt(road_deg**2 + gain**2 * a2)) for a2 in (left2, forward2))
+    return about_x, about_y, 0.0

@@ -33,13 +33,17 @@ TOGETHER_NS = 10_000_000  # shortest interval that gives a speed
 RECENT_NS = 700_000_000  # the motion counts as known this long after a pose; visual odometry delivers 5 poses a second
 RESTART_NS = 2_000_000_000  # during a gap this long an odometry may restart unnoticed
 FURTHEST_NS = round(1e9 * EXTRAPOLATION_S)  # extrapolation beyond the newest pose
-RECENT_MOTION_NS = 250_000_000  # interval of the two velocities whose difference is the acceleration
-LEVEL = 1e-6  # roll and pitch [rad] below any measurement
+ACCELERATION_NS, FEWEST = 600_000_000, 5  # time and number of poses over which an acceleration is measured, at least
+SAME_VERTICAL = 1e-6  # change of roll and pitch [rad] below any measurement
 
 
-def is_level(R_map_vehicle: Array64) -> bool:
-    """Whether a rotation (3, 3) has no roll and pitch at all: the odometry does not measure them."""
-    return bool(np.abs(R_map_vehicle[2, :2]).max() < LEVEL)
+def same_vertical(R_map_vehicle: Array64, R_before: Array64) -> bool:
+    """Whether two rotations (3, 3) have exactly the same roll and pitch: the odometry does not measure them.
+
+    A tilted mount has the same vertical in the vehicle's axes, a tilted frame has it in those of the map.
+    """
+    difference = np.abs(R_map_vehicle - R_before)
+    return bool(min(difference[2].max(), difference[:, 2].max()) < SAME_VERTICAL)
 
 
 class VehicleTrajectory:
@@ -66,9 +70,11 @@ class VehicleTrajectory:
         return bool(self._poses) and stamp_ns - self._poses[-1][0] < RECENT_NS
 
     @property
-    def is_level(self) -> bool:
-        """Whether the newest pose has no roll and pitch at all, as where wheels alone measure."""
-        return bool(self._poses) and is_level(self._poses[-1][1])
+    def measures_tilt(self) -> bool:
+        """Whether roll and pitch have changed in the newest poses; those of wheels alone never do."""
+        return bool(self._poses) and not same_vertical(
+            self._poses[-1][1], self._poses[-min(FEWEST, len(self._poses))][1]
+        )
 
     @property
     def newest_ns(self) -> int | None:
@@ -116,7 +122,7 @@ class VehicleTrajectory:
         newest_ns, oldest_ns = self._poses[-1][0], max(self._poses[0][0], self.frame_start_ns)
         speed_known = newest_ns - oldest_ns >= TOGETHER_NS
         expected, seconds = self.constant_velocity(motion.stamp_ns), (motion.stamp_ns - newest_ns) * 1e-9
-        speed_mps = math.hypot(*self._newest_rates()[1].tolist()) if speed_known else None
+        speed_mps = self.newest_speed_mps if speed_known else None
         return is_reachable(expected, self._in_map(motion), seconds, speed_mps)
 
     def _in_map(self, motion: VehicleMotion) -> tuple[Array64, Array64]:
@@ -207,14 +213,30 @@ class VehicleTrajectory:
         """The vehicle's velocity (3,) in frame map."""
         return (self.at(stamp_ns + STEP_NS)[1] - self.at(stamp_ns)[1]) / (STEP_NS * 1e-9)
 
-    def recent_motion(self, stamp_ns: int) -> tuple[Array64, Array64]:
-        """Mean velocity (3,) and acceleration (3,) of the last 0.5 s, vehicle axes; zero where no pose gives them."""
-        if not self._poses or stamp_ns - 2 * RECENT_MOTION_NS < max(self._poses[0][0], self.frame_start_ns):
-            return np.zeros(3), np.zeros(3)
-        R, now = self.at(stamp_ns)
-        before, first = (self.at(stamp_ns - k * RECENT_MOTION_NS)[1] for k in (1, 2))
-        seconds = RECENT_MOTION_NS * 1e-9
-        return R.T @ (now - first) / (2.0 * seconds), R.T @ (now - 2.0 * before + first) / seconds**2
+    @property
+    def newest_speed_mps(self) -> float:
+        """Speed at the newest pose, as extrapolation uses it. There has to be a pose."""
+        return math.hypot(*self._newest_rates()[1].tolist())
+
+    def newest_acceleration(self) -> tuple[Array64, Array64] | None:
+        """Acceleration (3,) [m/s^2] and its variance (3,), vehicle axes, by a parabola through the newest poses.
+
+        None: the current start frame has too few of them. There has to be a pose.
+        """
+        newest_ns, R, newest_m = self._poses[-1]
+        times, places = [], []
+        for ns, _, t in reversed(self._poses):
+            if ns < self.frame_start_ns or (newest_ns - ns > ACCELERATION_NS and len(times) >= FEWEST):
+                break
+            times.append(1e-9 * (ns - newest_ns))
+            places.append(t - newest_m)
+        if len(times) < FEWEST:
+            return None
+        A = np.vander(times, 3, increasing=True) * [1.0, 1.0, 0.5]
+        inverse = np.linalg.inv(A.T @ A)
+        fitted = inverse @ A.T @ np.array(places)
+        noise_m2 = ((places - A @ fitted) ** 2).sum(axis=0) / (len(times) - 3)
+        return R.T @ fitted[2], (R.T**2) @ noise_m2 * inverse[2, 2]
 
     def constant_velocity(self, stamp_ns: int) -> tuple[Array64, Array64]:
         """R and t extrapolated with the newest rates, without the horizon that `at` has."""

@@ -7,9 +7,10 @@ an outlier share o with a constant density u, so no single one excludes a hypoth
     L = (1 - o) N(r; 0, S) + o u,   w <- w L,   beta = (1 - o) N / L
     x <- x + beta K r,   P <- P - beta K S K^T + beta (1 - beta) K r r^T K^T        (moments of both cases)
 
-Hypotheses that agree are merged, improbable ones dropped. Those more than NEAR_RAD apart are merged only where there
-are too many: a probability of 0.0004 of yaws round the circle would widen a sigma of 4.5 deg to 5. A hypothesis with a
-large yaw sigma is split in three, so that the linearisation holds.
+Hypotheses that agree are merged, improbable ones dropped. Those more than NEAR_RAD apart do not agree, whatever their
+weights: a probability of 0.0004 of yaws round the circle would widen a sigma of 4.5 deg to 5. Where there are too many,
+those are merged that lose least, in proportion to their probability. A hypothesis with a large yaw sigma is split in
+three, so that the linearisation holds.
 
 START_GYRO_BIAS: ArduPilot averages the gyro at boot until two averages agree within 0.1 deg/s = 0.0017 rad/s
 (AP_InertialSensor::_init_gyro). In the log of a flight (Pixhawk, ArduCopter 3.1.3, two IMUs, 330 s) calibrated gyros
@@ -53,7 +54,6 @@ WIDEST_YAW_RAD = math.radians(22.0)  # a hypothesis with a larger sigma is split
 SPLIT_SHARE, SPLIT_SHIFT, SPLIT_SIGMA = 0.2252, 1.0566, 0.6716
 DROPPED = 1e-8  # a less probable hypothesis is dropped
 LOSS = 0.2  # of information [nat] below which two hypotheses may be merged, for each unit of their probability
-FAR_LOSS = 1e3  # more than any merge loses: of hypotheses more than NEAR_RAD apart
 ALIKE_RAD = math.radians(3.0)
 NEAR_RAD = math.radians(20.0)  # a yaw this near to the right one counts as right
 WITH_CAMERAS_RAD = math.radians(10.0)  # the same, while matches of cameras may be of another street
@@ -170,12 +170,14 @@ class InertialBank:
         a = weight[:, None] / (weight[:, None] + weight[None, :])
         merged2 = a * variance[:, None] + (1 - a) * variance[None, :] + a * (1 - a) * apart**2
         cost = 0.5 * (np.log(merged2) - a * np.log(variance[:, None]) - (1 - a) * np.log(variance[None, :]))
-        cost[apart > NEAR_RAD] += FAR_LOSS
         cost[np.tril_indices(n)] = cost[self.tied[:, None] != self.tied] = math.inf
         merged = cost < LOSS if n > STARTS else (cost < 0.1 * LOSS) | ((apart < ALIKE_RAD) & (cost < LOSS))
+        merged &= apart <= NEAR_RAD
         if not np.isfinite(cost).any() or (n <= MOST and not merged.any()):
             return False
-        i, j = np.unravel_index(int(np.argmin(np.where(merged, cost, cost + 1e6))), cost.shape)
+        if not merged.any():
+            merged, cost = np.isfinite(cost), cost * (weight[:, None] + weight[None, :])
+        i, j = np.unravel_index(int(np.argmin(np.where(merged, cost, math.inf))), cost.shape)
         pair = np.array([i, j])
         share = np.exp(self.log_weight[pair] - _log_sum(self.log_weight[pair]))
         one = moments(self.state.rows(pair), share)

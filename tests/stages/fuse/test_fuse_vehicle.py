@@ -405,12 +405,13 @@ def test_beyond_its_newest_pose_a_vehicle_may_have_braked_and_turned():
     assert math.sqrt(later[2, 2]) == pytest.approx(0.5 * 2.0 * 0.4**2 + 6.0 * 0.1)
 
 
-def braking(R_tilt: Array64) -> VehicleTrajectory:
-    """A vehicle with this tilt in its odometry brakes by 4 m/s2 and is pushed to its left by 2 m/s2, at 4 m/s in the end."""
+def braking(roll_rad: float) -> VehicleTrajectory:
+    """A vehicle, in its odometry rolling by so much in 1 s, brakes by 4 m/s2 to 4 m/s, pushed to its left by 2 m/s2."""
     vehicle = VehicleTrajectory(joined=False)
     for t in np.arange(0.0, 1.01, 0.02):
         place = np.array([8.0 * t - 2.0 * t**2, t**2, 0.0])
-        vehicle.add(VehicleMotion(stamp_ns=ns(t), xyz_map_m=place, R_map_vehicle=R_tilt, covariance=None))
+        R = exp_rotation(np.array([roll_rad * t, 0.0, 0.0]))
+        vehicle.add(VehicleMotion(stamp_ns=ns(t), xyz_map_m=place, R_map_vehicle=R, covariance=None))
     return vehicle
 
 
@@ -420,13 +421,41 @@ def test_the_tilt_of_a_vehicle_that_its_odometry_does_not_measure_is_in_the_erro
     rng, sigmas_rad = np.random.default_rng(1), np.radians([math.hypot(1.0, 0.4), math.hypot(2.0, 0.4), 0.0])
     fix = DroneFix(stamp_ns=ns(1.0), xyz_vehicle_m=xyz_m, covariance_m2=1e-6 * np.eye(3), hits=9)
     turned = [exp_rotation(sigmas_rad * rng.standard_normal(3)) @ xyz_m for _ in range(4000)]
-    level, measured = braking(np.eye(3)), braking(exp_rotation(np.array([1e-3, 0.0, 0.0])))
+    level, measured = braking(0.0), braking(1e-3)
     errors, none = (FuseErrors(vehicle_tilt_deg=0.4 * k, vehicle_tilt_deg_per_mps2=0.5 * k) for k in (1, 0))
     tilted = fix_covariance(fix, level, errors)
     np.testing.assert_allclose(tilted.whole, np.cov(np.array(turned).T), atol=0.06 * (sigmas_rad[1] * 12.0) ** 2)
-    parked = VehicleTrajectory(joined=False)
-    parked.add(VehicleMotion(stamp_ns=ns(0.0), xyz_map_m=np.zeros(3), R_map_vehicle=np.eye(3), covariance=None))
-    for vehicle, assumed in ((level, none), (measured, errors), (parked, errors)):
+    for vehicle, assumed in ((level, none), (measured, errors), (level_at(0.0, count=40), errors)):
         without = fix_covariance(fix, vehicle, assumed)
         np.testing.assert_allclose(without.white, 0.75 * 0.7e-6 * np.eye(3), atol=1e-12)
         np.testing.assert_allclose(tilted.bias, without.bias, atol=1e-12)
+
+
+def level_at(speed_mps: float, count: int) -> VehicleTrajectory:
+    """A level vehicle with a constant speed; its newest pose is at 1.0 s."""
+    vehicle = VehicleTrajectory(joined=False)
+    for t in 1.0 - 0.02 * np.arange(count)[::-1]:
+        place = np.array([speed_mps * t, 0.0, 0.0])
+        vehicle.add(VehicleMotion(stamp_ns=ns(t), xyz_map_m=place, R_map_vehicle=np.eye(3), covariance=None))
+    return vehicle
+
+
+@pytest.mark.parametrize(
+    ("speed_mps", "count", "late_s", "sigma_deg"),
+    [
+        (0.0, 3, 0.0, 0.0),
+        (8.0, 3, 0.0, math.hypot(0.4, 1.0)),
+        (8.0, 40, 0.0, 0.4),
+        (8.0, 40, 0.6, 0.4),
+        (0.4, 40, 0, 0.16),
+    ],
+)
+def test_the_assumed_tilt_by_the_road_and_before_the_acceleration_is_measured(speed_mps, count, late_s, sigma_deg):
+    """0.4 deg by the road from 1 m/s on; 2 m/s2 in traffic. Late, as extrapolated, it has not braked."""
+    fix = DroneFix(
+        stamp_ns=ns(1.0 + late_s), xyz_vehicle_m=np.array([0, 0, 10.0]), covariance_m2=1e-9 * np.eye(3), hits=9
+    )
+    vehicle, errors = level_at(speed_mps, count), FuseErrors(vehicle_tilt_deg=0.4, vehicle_tilt_deg_per_mps2=0.5)
+    level = fix_covariance(fix, vehicle, FuseErrors(vehicle_tilt_deg=0.0, vehicle_tilt_deg_per_mps2=0.0))
+    by_tilt_m2 = fix_covariance(fix, vehicle, errors).white - level.white
+    np.testing.assert_allclose(by_tilt_m2, (10.0 * math.radians(sigma_deg)) ** 2 * np.diag([1.0, 1.0, 0.0]), atol=1e-9)

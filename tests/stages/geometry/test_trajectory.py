@@ -277,27 +277,58 @@ def test_the_vehicles_velocity_is_the_derivative_of_its_position():
     np.testing.assert_array_equal(trail().velocity_mps(START_NS), np.zeros(3))
 
 
-@pytest.mark.parametrize("speed_mps", [0.0, 8.0])
-def test_the_recent_motion_of_the_vehicle_is_in_its_own_axes(speed_mps: float):
-    """It drives towards -y of map, brakes by 2 m/s2 and is pushed to its left by 1 m/s2, from 0.6 s on."""
-    made, R = VehicleTrajectory(joined=False), rotation_z(-np.pi / 2)
-    for k in range(61):
-        t, braked = 0.02 * k, max(0.02 * k - 0.6, 0.0) ** 2 / 2
-        made.add(motion(20 * k * MS, R @ [speed_mps * t - 2.0 * braked, braked, 0.0], R))
-    for at_ms, speed_lost, acceleration in ((600, 0.0, 0.0), (1200, 0.35, 1.0)):
-        velocity, changed = made.recent_motion(START_NS + at_ms * MS)
-        np.testing.assert_allclose(velocity, (speed_mps - 2.0 * speed_lost, speed_lost, 0.0), atol=0.001)
-        np.testing.assert_allclose(changed, (-2.0 * acceleration, acceleration, 0.0), atol=0.01)
+def braking(rate_hz: float, noise_m: float = 0.0, until_s: float = 1.2, seed: int = 0) -> VehicleTrajectory:
+    """It drives towards -y of map at 8 m/s, brakes by 2 m/s2 and is pushed to its left by 1 m/s2."""
+    made, R, rng = VehicleTrajectory(joined=False), rotation_z(-np.pi / 2), np.random.default_rng(seed)
+    for t in np.arange(0.0, until_s, 1.0 / rate_hz):
+        at = R @ [8.0 * t - t**2, 0.5 * t**2, 0.0] + rng.normal(0.0, noise_m, 3)
+        made.add(motion(round(1e9 * t), at, R))
+    return made
 
 
-def test_the_recent_motion_is_zero_before_the_first_pose_and_has_no_jump_of_the_start_frame():
-    assert not np.any(VehicleTrajectory().recent_motion(START_NS))
+@pytest.mark.parametrize("rate_hz", [5, 50, 200, 1000])
+def test_the_vehicles_acceleration_is_in_its_own_axes(rate_hz: float):
+    found = braking(rate_hz).newest_acceleration()
+    assert found is not None
+    np.testing.assert_allclose(found[0], (-2.0, 1.0, 0.0), atol=1e-6)
+    np.testing.assert_allclose(found[1], np.zeros(3), atol=1e-6)
+
+
+def test_the_variance_of_the_vehicles_acceleration_is_by_the_noise_of_its_poses():
+    found = [braking(50, 0.02, seed=seed).newest_acceleration() for seed in range(200)]
+    off = np.array([one[0] - [-2.0, 1.0, 0.0] for one in found if one is not None])
+    variance = np.array([one[1] for one in found if one is not None])
+    np.testing.assert_allclose((off**2).mean(axis=0) / variance.mean(axis=0), np.ones(3), atol=0.3)
+    assert 0.1 < off.std() < 0.4
+
+
+def test_no_acceleration_is_taken_from_few_poses_or_across_a_jump_of_the_start_frame():
+    assert braking(50, until_s=0.07).newest_acceleration() is None
     made = VehicleTrajectory(joined=False)
     for k in range(60):
         made.add(motion(20 * k * MS, (0.1 * k + (3 if k >= 30 else 0), 0, 0)))  # 5 m/s
-        velocity, acceleration = made.recent_motion(START_NS + 20 * k * MS)
-        assert velocity[0] == pytest.approx(0.0 if 20 * k < 500 or 32 <= k < 55 else 5.0)
-        np.testing.assert_allclose(acceleration, np.zeros(3), atol=1e-9)
+        found = made.newest_acceleration()
+        assert (found is None) == (k < 4 or 32 <= k < 34)
+        if found is not None:
+            np.testing.assert_allclose(found[0], np.zeros(3), atol=1e-9)
+
+
+TILTED = rotation_from_rpy_deg((1.0, 2.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("turned", "measures"),
+    [
+        (lambda yaw: rotation_z(yaw), False),
+        (lambda yaw: TILTED @ rotation_z(yaw), False),  # a tilted frame
+        (lambda yaw: rotation_z(yaw) @ TILTED, False),  # a tilted mount
+        (lambda yaw: rotation_z(yaw) @ rotation_from_rpy_deg((0.1 * yaw, 0.0, 0.0)), True),
+    ],
+)
+def test_an_odometry_whose_vertical_never_changes_does_not_measure_the_tilt(turned, measures: bool):
+    assert not VehicleTrajectory().measures_tilt
+    made = trail(*(motion(20 * k * MS, (0.1 * k, 0, 0), turned(0.01 * k)) for k in range(20)))
+    assert made.measures_tilt == measures
 
 
 def test_relative_velocity_contains_the_vehicles_translation_and_rotation():

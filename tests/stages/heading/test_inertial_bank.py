@@ -163,11 +163,17 @@ def test_a_trace_of_other_yaws_does_not_widen_the_yaw_that_is_known():
 
 
 def test_of_too_many_hypotheses_those_are_merged_that_lose_least():
-    yaws = np.array([[0.0, 0.0, yaw] + [0.0] * 12 for yaw in 2.0 * math.pi * np.arange(30) / 30])
-    bank = InertialBank(one(sigma=0.05).rows(np.zeros(30, dtype=np.intp)).moved(yaws), np.zeros(30))
+    """Improbable ones, although the probable ones are nearer to each other."""
+    yaws = np.r_[0.0, 0.1, np.radians(np.arange(40, 320, 9))]
+    turned = np.column_stack([np.zeros((len(yaws), 2)), yaws, np.zeros((len(yaws), 12))])
+    bank = InertialBank(
+        one(sigma=0.02).rows(np.zeros(len(yaws), dtype=np.intp)).moved(turned), np.r_[0.0, 0.0, np.full(32, -9.0)]
+    )
     bank.tidy()
     assert len(bank.state) == MOST
-    assert math.isclose(bank.weight.sum(), 1.0)
+    probable = bank.weight > 0.1
+    assert np.allclose(np.sort(bank.state.yaw_rad[probable]), [0.0, 0.1], atol=1e-6)
+    assert np.allclose(bank.state.yaw_variance_rad2[probable], 0.02**2)
 
 
 def test_a_wide_hypothesis_is_split_without_a_change_of_its_moments():

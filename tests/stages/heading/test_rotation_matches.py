@@ -52,6 +52,16 @@ def test_one_match_leaves_four_equally_probable_branches_and_the_case_that_it_is
         assert bank.weight[narrow & (off < 0.05)].sum() == pytest.approx(0.225, abs=0.02)
 
 
+def test_many_matches_stay_apart_however_many_hypotheses_that_makes():
+    """The wide free hypotheses are merged instead."""
+    bank, streets_deg = any_yaw(), (2.0, 14.0, 27.0, 45.0)
+    for _ in range(6):
+        add_matches(bank, matches(*streets_deg, p=(0.4, 0.25, 0.15, 0.1)), 1.0)
+    sigma_rad = np.sqrt(bank.state.yaw_variance_rad2[bank.tied])
+    assert len(sigma_rad) == 4 * len(streets_deg)
+    assert sigma_rad.max() < math.radians(1.0)
+
+
 def test_two_matches_share_the_probability_as_stated():
     bank = any_yaw()
     add_matches(bank, matches(20.0, 54.0, p=(0.6, 0.3)), 1.0)

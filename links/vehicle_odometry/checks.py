@@ -33,8 +33,8 @@ class VehicleOdometryChecks(LinkChecks):
         yield odometry_check(source, source.link)
         motions = observations.all(VehicleMotion)
         if motions and all(same_vertical(motion.R_map_vehicle, motions[0].R_map_vehicle) for motion in motions):
-            assumed = "assumed are those of a car, by its acceleration (fuse.errors.vehicle_tilt_deg_per_mps2)"
-            yield ok(f"{source.name} tilt", f"it reports no roll and pitch: {assumed}")
+            assumed = "if it does not measure them, those of a car are assumed (fuse.errors.vehicle_tilt_deg_per_mps2)"
+            yield ok(f"{source.name} tilt", f"its roll and pitch do not change: {assumed}")
 
 
 def odometry_check(source: ObservedSource, link: VehicleOdometry) -> CheckResult:

@@ -224,7 +224,8 @@ class VehicleTrajectory:
         None: the current start frame has too few of them. There has to be a pose.
         """
         newest_ns, R, newest_m = self._poses[-1]
-        times, places = [], []
+        times: list[float] = []
+        places: list[Array64] = []
         for ns, _, t in reversed(self._poses):
             if ns < self.frame_start_ns or (newest_ns - ns > ACCELERATION_NS and len(times) >= FEWEST):
                 break

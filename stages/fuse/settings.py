@@ -22,8 +22,8 @@ class FuseErrors(StrictModel):
     fix_time_s: float = Field(default=0.2, ge=0)  # time constant of the error of a fix
     # share of its variance that does not average out (calibration), where the tracker does not report it
     fix_bias_share: float = Field(default=0.25, ge=0, lt=1)
-    # roll and pitch of a vehicle whose odometry does not measure them: by the road, and by acceleration (a car: 3 to
-    # 6 deg per g)
+    # roll and pitch of a vehicle whose odometry does not measure them: by a paved road (assumed), and by acceleration
+    # (the body of a car: 3 to 6 deg per g)
     vehicle_tilt_deg: float = Field(default=0.2, ge=0, le=10)
     vehicle_tilt_deg_per_mps2: float = Field(default=0.5, ge=0, le=10)
     clock_s: float = Field(default=0.01, ge=0)  # of the stamps of IMU and LiDAR against each other

@@ -33,14 +33,15 @@ TOGETHER_NS = 10_000_000  # shortest interval that gives a speed
 RECENT_NS = 700_000_000  # the motion counts as known this long after a pose; visual odometry delivers 5 poses a second
 RESTART_NS = 2_000_000_000  # during a gap this long an odometry may restart unnoticed
 FURTHEST_NS = round(1e9 * EXTRAPOLATION_S)  # extrapolation beyond the newest pose
-ACCELERATION_NS, FEWEST = 600_000_000, 5  # time and number of poses over which an acceleration is measured, at least
+ACCELERATION_NS, FEWEST = 600_000_000, 5  # an acceleration is measured over both, by poses TOGETHER_NS apart
+SHORTEST_NS = 300_000_000  # fewer poses than FEWEST, or a shorter time, show no acceleration
 SAME_VERTICAL = 1e-6  # change of roll and pitch [rad] below any measurement
 
 
 def same_vertical(R_map_vehicle: Array64, R_before: Array64) -> bool:
-    """Whether two rotations (3, 3) have exactly the same roll and pitch: the odometry does not measure them.
+    """Whether two rotations (3, 3) differ by a turn about one vertical alone, as where roll and pitch are not measured.
 
-    A tilted mount has the same vertical in the vehicle's axes, a tilted frame has it in those of the map.
+    With a tilted mount the vertical is constant in the vehicle's axes, with a tilted frame in those of the map.
     """
     difference = np.abs(R_map_vehicle - R_before)
     return bool(min(difference[2].max(), difference[:, 2].max()) < SAME_VERTICAL)
@@ -224,15 +225,17 @@ class VehicleTrajectory:
         None: the current start frame has too few of them. There has to be a pose.
         """
         newest_ns, R, newest_m = self._poses[-1]
-        times: list[float] = []
+        ages_ns: list[int] = []
         places: list[Array64] = []
         for ns, _, t in reversed(self._poses):
-            if ns < self.frame_start_ns or (newest_ns - ns > ACCELERATION_NS and len(times) >= FEWEST):
+            if ns < self.frame_start_ns or (newest_ns - ns > ACCELERATION_NS and len(ages_ns) >= FEWEST):
                 break
-            times.append(1e-9 * (ns - newest_ns))
-            places.append(t - newest_m)
-        if len(times) < FEWEST:
+            if not ages_ns or newest_ns - ns - ages_ns[-1] >= TOGETHER_NS:
+                ages_ns.append(newest_ns - ns)
+                places.append(t - newest_m)
+        if len(ages_ns) < FEWEST or ages_ns[-1] < SHORTEST_NS:
             return None
+        times = -1e-9 * np.array(ages_ns)
         A = np.vander(times, 3, increasing=True) * [1.0, 1.0, 0.5]
         inverse = np.linalg.inv(A.T @ A)
         fitted = inverse @ A.T @ np.array(places)

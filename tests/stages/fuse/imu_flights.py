@@ -62,6 +62,7 @@ class ImuFlight:
     wind_mps: float = 3.0
     vehicle_mps: float = 0.0
     range_m: float = 20.0
+    turn_radps: float = 0.0  # about the vertical, besides the wobble of 0.3 rad
     # sources
     imu_hz: float = 50.0  # 0: no IMU
     vibration_mps2: float = 0.3  # of a sample, aliased
@@ -129,7 +130,11 @@ class ImuFlight:
             thrust = thrust + FINE_S / 0.08 * (turning - thrust)  # attitude follows in two steps
             a = thrust + drag - [0, 0, G]
             p, v = p + FINE_S * v + 0.5 * FINE_S**2 * a, v + FINE_S * a
-        yaw = rng.uniform(0, 6.28) + 0.3 * np.sin(2 * math.pi * t / rng.uniform(8, 20)) * (self.kind != "hover")
+        yaw = (
+            self.turn_radps * t
+            + rng.uniform(0, 6.28)
+            + 0.3 * np.sin(2 * math.pi * t / rng.uniform(8, 20)) * (self.kind != "hover")
+        )
         z = T / np.linalg.norm(T, axis=1)[:, None]
         x = np.column_stack([np.cos(yaw), np.sin(yaw), np.zeros(n)])
         y = np.cross(z, x)

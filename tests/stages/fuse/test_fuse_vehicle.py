@@ -16,7 +16,7 @@ from stages.fuse.settings import FuseErrors
 from stages.geometry.frames import Array64, heading_rad, rotation_z
 from stages.geometry.trajectory import VehicleTrajectory
 from stages.kernels.geometry.so3 import exp_rotation
-from stages.messages import DroneFix, HeadingPrior, MotionStatus, PoseState, VehicleMotion
+from stages.messages import DroneFix, HeadingPrior, MotionStatus, PoseEstimate, PoseState, VehicleMotion
 from tests.stages.fuse.fuse_inputs import late, outliers, poses_of, without
 from tests.stages.fuse.imu_flights import ImuFlight, ns, seconds
 from tests.stages.fuse.judged import CHI2_95, VEHICLE, Flown, fly, rms
@@ -230,6 +230,25 @@ def test_axes_of_an_earlier_run_end_with_a_contradiction():
     assert known
     assert len(known) == known[-1] - known[0] + 1
     assert axes[-1] is None
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.6])
+def test_axes_of_an_earlier_run_hold_while_the_drone_turns(late_s: float):
+    """By 170 deg/s: a LiDAR position that is used late is compared with the yaw of its own time."""
+    flight = ImuFlight(kind="fast", seed=2, until_s=12.0, turn_radps=3.0)
+    poses = poses_of(Fuse(), late(("fix",), late_s)(with_priors(flight.events(), flight)))
+    assert any(isinstance(pose.estimate, PoseEstimate) for pose in poses)
+    assert poses[-1].odom_yaw_rad == 0.3
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_axes_that_independent_telemetry_shows_in_another_frame_are_kept(seed: int):
+    """The heading from before the outage is contradicted; the axes are measured after it."""
+    flight = ImuFlight(kind="fast", seed=seed, until_s=20.0, odometry=True, vehicle_mps=5.0)
+    gap, jump = without(("motion",), 8.0, 10.0), jumped(10.0, 90.0, xyz_m=(0.0, 0.0, 0.0))
+    axes = [pose.odom_yaw_rad for pose in poses_of(Fuse(), jump(gap(flight.events()))) if pose.stamp_ns > ns(10.1)]
+    known = [k for k, yaw in enumerate(axes) if yaw is not None]
+    assert len(known) == len(axes) - known[0]
 
 
 def test_poses_of_the_vehicle_that_arrive_too_late_do_not_end_an_outage():

@@ -2,7 +2,8 @@
 
 A vehicle tilts on its suspension when it brakes or turns: about x by k a_left, about y by k a_forward, with k =
 `vehicle_tilt_deg_per_mps2`; and on an uneven road, by `vehicle_tilt_deg`. Where its odometry does not measure roll and
-pitch, these are one sigma of either. An acceleration that is not measured yet is that of traffic (USUAL_MANEUVER).
+pitch, these are one sigma of either. The acceleration is the measured one, weighted with that of traffic
+(USUAL_MANEUVER) by their variances.
 
 Source: ours; the shares: stages/fuse/settings.py.
 """
@@ -55,12 +56,12 @@ def fix_covariance(fix: DroneFix, vehicle: VehicleTrajectory, errors: FuseErrors
 def _tilt_rad(vehicle: VehicleTrajectory, errors: FuseErrors) -> tuple[float, float, float]:
     """One sigma of the vehicle's rotation about its axes, which its odometry does not measure."""
     moving = min(vehicle.newest_speed_mps / DRIVES_MPS, 1.0)
-    acceleration = vehicle.newest_acceleration()
-    if acceleration is None:
-        forward2, left2 = np.full(2, (moving * USUAL_MANEUVER.acceleration_mps2) ** 2)
-    else:
-        measured, variance = acceleration
-        forward2, left2 = np.maximum(measured**2 - variance, 0.0)[:2]  # a^2 without what noise adds to it
+    usual2 = (moving * USUAL_MANEUVER.acceleration_mps2) ** 2
+    forward2, left2 = usual2, usual2
+    if (acceleration := vehicle.newest_acceleration()) is not None:
+        measured, variance = (axes[:2] for axes in acceleration)
+        share = usual2 / np.maximum(usual2 + variance, np.finfo(float).tiny)
+        forward2, left2 = (share * measured) ** 2 + share * variance  # E[a^2 | measured], a ~ N(0, usual2)
     gain, road_deg = errors.vehicle_tilt_deg_per_mps2, moving * errors.vehicle_tilt_deg
     about_x, about_y = (math.radians(math.sqrt(road_deg**2 + gain**2 * a2)) for a2 in (left2, forward2))
     return about_x, about_y, 0.0

@@ -34,7 +34,6 @@ RECENT_NS = 700_000_000  # the motion counts as known this long after a pose; vi
 RESTART_NS = 2_000_000_000  # during a gap this long an odometry may restart unnoticed
 FURTHEST_NS = round(1e9 * EXTRAPOLATION_S)  # extrapolation beyond the newest pose
 ACCELERATION_NS, FEWEST = 600_000_000, 5  # an acceleration is measured over both, by poses TOGETHER_NS apart
-SHORTEST_NS = 300_000_000  # fewer poses than FEWEST, or a shorter time, show no acceleration
 SAME_VERTICAL = 1e-6  # change of roll and pitch [rad] below any measurement
 
 
@@ -233,7 +232,7 @@ class VehicleTrajectory:
             if not ages_ns or newest_ns - ns - ages_ns[-1] >= TOGETHER_NS:
                 ages_ns.append(newest_ns - ns)
                 places.append(t - newest_m)
-        if len(ages_ns) < FEWEST or ages_ns[-1] < SHORTEST_NS:
+        if len(ages_ns) < FEWEST:
             return None
         times = -1e-9 * np.array(ages_ns)
         A = np.vander(times, 3, increasing=True) * [1.0, 1.0, 0.5]

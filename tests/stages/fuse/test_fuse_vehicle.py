@@ -478,3 +478,20 @@ def test_the_assumed_tilt_by_the_road_and_before_the_acceleration_is_measured(sp
     level = fix_covariance(fix, vehicle, FuseErrors(vehicle_tilt_deg=0.0, vehicle_tilt_deg_per_mps2=0.0))
     by_tilt_m2 = fix_covariance(fix, vehicle, errors).white - level.white
     np.testing.assert_allclose(by_tilt_m2, (10.0 * math.radians(sigma_deg)) ** 2 * np.diag([1.0, 1.0, 0.0]), atol=1e-9)
+
+
+@pytest.mark.parametrize("noise_m", [0.002, 0.1])
+def test_the_assumed_tilt_by_acceleration_is_right_on_average_however_noisy_the_odometry(noise_m: float):
+    """Accelerations are drawn as in traffic, by 2 m/s2; poses noisy by 0.1 m measure one to 1.4 m/s2."""
+    fix = DroneFix(stamp_ns=ns(1.0), xyz_vehicle_m=np.array([0, 0, 10.0]), covariance_m2=1e-9 * np.eye(3), hits=9)
+    rng, by_tilt_m2 = np.random.default_rng(4), []
+    times_s = np.arange(0.0, 1.01, 0.02)
+    for forward, left in rng.normal(0.0, 2.0, (400, 2)):
+        vehicle = VehicleTrajectory(joined=False)
+        for t, noise in zip(times_s, rng.normal(0.0, noise_m, (len(times_s), 3)), strict=True):
+            place = np.array([12.0 * t + 0.5 * forward * t**2, 0.5 * left * t**2, 0.0]) + noise
+            vehicle.add(VehicleMotion(stamp_ns=ns(t), xyz_map_m=place, R_map_vehicle=np.eye(3), covariance=None))
+        assumed = [FuseErrors(vehicle_tilt_deg=0.0, vehicle_tilt_deg_per_mps2=k) for k in (0.5, 0.0)]
+        tilted, level = (fix_covariance(fix, vehicle, errors).white for errors in assumed)
+        by_tilt_m2.append(np.diag(tilted - level)[:2])
+    np.testing.assert_allclose(np.mean(by_tilt_m2, axis=0), (10.0 * math.radians(1.0)) ** 2, rtol=0.12)

@@ -303,12 +303,12 @@ def test_the_variance_of_the_vehicles_acceleration_is_by_the_noise_of_its_poses(
 
 
 def test_no_acceleration_is_taken_from_few_poses_or_across_a_jump_of_the_start_frame():
-    assert braking(50, until_s=0.29).newest_acceleration() is None
+    assert braking(50, until_s=0.07).newest_acceleration() is None
     made = VehicleTrajectory(joined=False)
     for k in range(60):
         made.add(motion(20 * k * MS, (0.1 * k + (3 if k >= 30 else 0), 0, 0)))  # 5 m/s
         found = made.newest_acceleration()
-        assert (found is None) == (k < 15 or 32 <= k < 45)
+        assert (found is None) == (k < 4 or 32 <= k < 34)
         if found is not None:
             np.testing.assert_allclose(found[0], np.zeros(3), atol=1e-9)
 

@@ -221,6 +221,12 @@ def _ardupilot(yaw: YawOutput, source_set: int) -> tuple[RequiredParameter, ...]
         RequiredParameter("AHRS_EKF_TYPE", (3.0,), why="only EKF3 fuses an external pose"),
         RequiredParameter("EK3_ENABLE", (1.0,), why="EKF3 must run"),
         RequiredParameter("EK3_SRC_OPTIONS", bits_off=1, why="1 fuses the velocities of all source sets: a fly-away"),
+        RequiredParameter(
+            "INS_ACCEL_FILTER",
+            at_least=10.0,
+            at_most=30.0,
+            why="Hz: with more, vibration is aliased into the IMU stream; with less, its samples are older than assumed",
+        ),
         RequiredParameter("VISO_TYPE", (1.0,), why="MAVLink; 3 (VOXL) would hide resets behind an offset"),
         RequiredParameter(own + "POSXY", (EXTERNAL,), why="horizontal position from grd"),
         RequiredParameter(own + "POSZ", (EXTERNAL, 1.0), why="height from grd, or the barometer"),

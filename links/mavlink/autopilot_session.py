@@ -270,6 +270,7 @@ class AutopilotSession:
                     if message.tc1 == 0:
                         self._send(dialect().MAVLink_timesync_message(self._now_ns(), message.ts1))
                     elif self._timesync.on_reply(message.ts1, arrival_ns, self.poses.sending):
+                        self._on_estimate(self.poses.autopilot.on_timesync(message.tc1 // 1_000_000))
                         return message.ts1
         return arrival_ns
 

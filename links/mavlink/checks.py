@@ -150,7 +150,11 @@ def _heartbeat(
             name, f"the autopilot is {reported}, the configuration has {link.settings.profile}: set profile: {reported}"
         )
     if status.failsafe:
-        return fail(name, "its state is critical, emergency or termination: read its own messages")
+        return fail(
+            name,
+            "its state is critical, emergency or termination: read its own messages (after a landing on grd's source "
+            "set: select set 1, or reboot it)",
+        )
     if source.live and status.armed:
         return fail(name, "it is armed: disarm it before a preflight")
     if source.live and silent_s > HEARTBEAT_GAP_S:
@@ -186,7 +190,7 @@ def _clock(source: ObservedSource, status: AutopilotStatus) -> CheckResult:
         return warning(
             name,
             "its TIMESYNC replies are earlier than its other messages allow, so the error of its clock is not known "
-            "(SITL subtracts the time of a slow line that it does not have: SERIAL0_BAUD 1500)",
+            "(SITL subtracts the time of a slow line that it does not have: set SERIALn_BAUD of this port to 1500)",
         )
     if status.clock_uncertainty_ns is None:
         foreign = source.counters.rejected.get(FOREIGN_TIMESYNC, 0)

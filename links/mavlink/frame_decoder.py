@@ -20,7 +20,7 @@ from links.clock.device_clock import DeviceClock
 from links.mavlink.poses.independence import Independence
 from links.mavlink.poses.odom_frame import read_odom_frame
 from links.mavlink.readers import READERS, TIMELESS_READERS, AutopilotMessage, is_ranging_radio
-from links.mavlink.streams.imu_stamps import DELAY_NS, ImuSelection, time_since_boot_us
+from links.mavlink.streams.imu_stamps import DELAY_NS, ImuSelection
 from links.mavlink.transport.framing import SEQUENCE, header, known, parse_frame, timesync_target
 from stages.messages import (
     AutopilotStatus,
@@ -114,16 +114,11 @@ class FrameDecoder:
         in_ms, kind = hasattr(frame, "time_boot_ms"), frame.get_type()
         if kind == ARRIVAL_STAMPED:
             return arrival_ns
-        device_ns = frame.time_boot_ms * 1_000_000 if in_ms else self._device_ns(kind, frame.time_usec, arrival_ns)
+        device_ns = frame.time_boot_ms * 1_000_000 if in_ms else frame.time_usec * 1000
         stamp_ns = self.clock.read(device_ns, arrival_ns)
         if stamp_ns is None:
             return None
         return min(stamp_ns + BOOT_TIME_TRUNCATION_NS * in_ms, arrival_ns) - DELAY_NS.get(kind, 0)
-
-    def _device_ns(self, kind: str, time_usec: int, arrival_ns: int) -> int:
-        offset_ns = self.clock.offset_ns
-        expected_us = None if offset_ns is None else (arrival_ns - offset_ns) // 1000
-        return time_since_boot_us(kind, time_usec, expected_us) * 1000
 
     def sent(self, record: Record) -> None:
         """A frame that we sent, from a recording."""

@@ -225,7 +225,7 @@ def _ardupilot(yaw: YawOutput, source_set: int) -> tuple[RequiredParameter, ...]
             "INS_ACCEL_FILTER",
             at_least=10.0,
             at_most=30.0,
-            why="Hz: with more, vibration is aliased into the IMU stream; with less, its samples are older than assumed",
+            why="Hz: with more, vibration is aliased into the IMU stream; with less, samples are older than assumed",
         ),
         RequiredParameter("VISO_TYPE", (1.0,), why="MAVLink; 3 (VOXL) would hide resets behind an offset"),
         RequiredParameter(own + "POSXY", (EXTERNAL,), why="horizontal position from grd"),

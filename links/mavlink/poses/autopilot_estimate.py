@@ -69,7 +69,7 @@ class AutopilotEstimate:
     def __init__(self) -> None:
         self.attitude: AutopilotAttitude | None = None
         self.position: AutopilotPosition | None = None
-        self._newest_ms: int | None = None  # time since boot, of any message
+        self._newest_ms: dict[str, int] = {}  # time since boot: of any message, and of replies to TIMESYNC
         self._attitude_ms = 0  # the same of the attitude
         self._yaw_rate = 0.0
 
@@ -78,10 +78,7 @@ class AutopilotEstimate:
         boot_ms = getattr(message, "time_boot_ms", None)
         if boot_ms is None:
             return None
-        booted = self._newest_ms is not None and boot_ms < self._newest_ms - MIN_BOOT_STEP_MS
-        self._newest_ms = boot_ms if booted else max(boot_ms, self._newest_ms or 0)
-        if booted:
-            self.attitude = self.position = None
+        event = self._on_time("messages", boot_ms)
         kind, yaw_reset = message.get_type(), False
         if kind == "ATTITUDE":
             yaw_reset = self._add_attitude(message, arrival_ns)
@@ -89,9 +86,20 @@ class AutopilotEstimate:
             values = np.array([message.x, message.y, message.z, message.vx, message.vy, message.vz])
             if np.isfinite(values).all():
                 self.position = AutopilotPosition(arrival_ns, flip_yz(values[:3]), flip_yz(values[3:]))
-        if booted:
-            return EstimateEvent.BOOTED
-        return EstimateEvent.YAW_RESET if yaw_reset else None
+        return event or (EstimateEvent.YAW_RESET if yaw_reset else None)
+
+    def on_timesync(self, device_ms: int) -> EstimateEvent | None:
+        """Add the autopilot's time of a reply to TIMESYNC: for seconds after a boot nothing else may have a time."""
+        return self._on_time("TIMESYNC", device_ms)
+
+    def _on_time(self, source: str, device_ms: int) -> EstimateEvent | None:
+        newest_ms = self._newest_ms.get(source, device_ms)
+        self._newest_ms[source] = max(device_ms, newest_ms)
+        if device_ms >= newest_ms - MIN_BOOT_STEP_MS:
+            return None
+        self._newest_ms = {source: device_ms}
+        self.attitude = self.position = None
+        return EstimateEvent.BOOTED
 
     def _add_attitude(self, message: Any, arrival_ns: int) -> bool:
         """Whether the yaw was reset since the attitude before."""

@@ -3,11 +3,9 @@
 ArduPilot stamps RAW_IMU and SCALED_IMU when it sends them; the values are the newest of its main loop (400 Hz: 0 to
 2.5 ms old) behind the low-pass filters INS_ACCEL_FILTER and INS_GYRO_FILTER (20 Hz, second order: sqrt(2) / (2 pi f) =
 11.3 ms). Together 12.5 ms, with a jitter of 0.7 ms; the stamp here is earlier by this delay. Other filter settings have
-other delays: 22.5 ms at 10 Hz. PX4 stamps HIGHRES_IMU with the time of the sample; its values are the means over an
-integration interval of 2.5 to 5 ms, 2 ms old.
-
-Older versions of ArduPilot take RAW_IMU's time from a 32-bit counter of microseconds, which starts again after
-71.6 min.
+other delays: 22.5 ms at 10 Hz. With 80 Hz for the gyro its values are 8 ms newer than assumed, 0.5 deg at 1 rad/s. PX4
+stamps HIGHRES_IMU with the time of the sample; its values are the means over an integration interval of 2.5 to 5 ms,
+2 ms old.
 
 ArduPilot's SCALED_IMU and HIGHRES_IMU (since 4.6) have the values of RAW_IMU: messages of the same samples would be one
 stream with wrong times. Only the first of PREFERENCE that arrives is used.
@@ -24,7 +22,6 @@ DELAY_NS: dict[str, int] = {"RAW_IMU": 12_500_000, "SCALED_IMU": 12_500_000, "HI
 
 PREFERENCE = ("RAW_IMU", "HIGHRES_IMU", "SCALED_IMU")
 PREFERENCE_TIMEOUT_NS = 2_000_000_000  # so long after one of them those behind it are not used
-COUNTER_US = 2**32
 
 
 class ImuSelection:
@@ -40,10 +37,3 @@ class ImuSelection:
         self._newest_ns[kind] = arrival_ns
         before = (self._newest_ns.get(other) for other in PREFERENCE[: PREFERENCE.index(kind)])
         return all(ns is None or arrival_ns - ns > PREFERENCE_TIMEOUT_NS for ns in before)
-
-
-def time_since_boot_us(kind: str, time_usec: int, expected_us: int | None) -> int:
-    """RAW_IMU's time since boot without the steps of a 32-bit counter: the one nearest to `expected_us`, if known."""
-    if kind != "RAW_IMU" or time_usec >= COUNTER_US or expected_us is None or expected_us < COUNTER_US // 2:
-        return time_usec
-    return time_usec + COUNTER_US * round((expected_us - time_usec) / COUNTER_US)

@@ -3,7 +3,7 @@
 One request is under way at a time, because an acknowledgement does not name its message. A request without one is
 repeated; a denied rate is halved, an unsupported message replaced by the next alternative. The requests start again
 after a boot of the autopilot and after silence. The rates that arrive are measured: one that falls
-below what was accepted is requested again, and the IMU below 10 Hz is a status with what to do.
+below what was accepted is requested again, after 1 to 2 s, and the IMU below 10 Hz is a status with what to do.
 
 What the autopilots do with a request:
     ArduPilot: truncates the interval to whole milliseconds; denies a rate above 0.8 SCHED_LOOP_RATE, and a request
@@ -40,8 +40,8 @@ from links.mavlink.commands import (
 from links.mavlink.profiles import ProfileName
 
 SET_MESSAGE_INTERVAL = 511  # MAV_CMD
-RETRY_PERIOD_NS = 10_000_000_000  # between requests for a message that is given up, or whose rate fell
-RATE_WINDOW_NS = 2_000_000_000  # in which a rate is measured
+RETRY_PERIOD_NS = 10_000_000_000  # between requests for a message that is given up, or that never had its rate
+RATE_WINDOW_NS, RATE_MESSAGES = 1_000_000_000, 10  # a rate is measured over both
 NEEDED_IMU_HZ = 10.0  # heading and preintegration work from this rate on
 LOW_SHARE = 0.7  # of the accepted rate: below, it is requested again
 NAMES: dict[str, int] = {
@@ -81,6 +81,7 @@ class _Stream:
     rate_hz: float  # to request; halved when it is denied
     name_at: int = 0
     settled: bool = False  # accepted, or given up
+    arrived: bool = False  # at its rate, since it was accepted
     answer: str = ""  # of the autopilot, unless it accepted
     denied_hz: float | None = None  # the highest denied rate
     next_ns: int = 0  # no request before
@@ -95,13 +96,14 @@ class _Rate:
     """Messages of one type per window."""
 
     start_ns: int
+    window_ns: int = RATE_WINDOW_NS
     count: int = 0
     hz: float | None = None  # of the newest complete window
 
     def update(self, now_ns: int) -> None:
         """Close windows that have ended."""
         elapsed_ns = now_ns - self.start_ns
-        if elapsed_ns >= RATE_WINDOW_NS:
+        if elapsed_ns >= self.window_ns:
             self.hz = self.count * 1e9 / elapsed_ns
             self.start_ns, self.count = now_ns, 0
 
@@ -180,8 +182,10 @@ class MessageIntervals:
         (stream, _), self._pending = self._pending, None
         stream.next_ns = now_ns
         if result == ACCEPTED:
-            stream.settled, stream.answer, stream.next_ns = True, "", now_ns + RETRY_PERIOD_NS
-            self._rates[stream.name] = _Rate(now_ns)  # the old rate does not count
+            stream.settled, stream.arrived, stream.answer = True, False, ""
+            stream.next_ns = now_ns + RETRY_PERIOD_NS
+            window_ns = max(RATE_WINDOW_NS, round(RATE_MESSAGES * 1e9 / stream.rate_hz))
+            self._rates[stream.name] = _Rate(now_ns, window_ns)  # the old rate does not count
         elif result == TEMPORARILY_REJECTED:
             stream.answer, stream.next_ns = "is busy", now_ns + ACK_TIMEOUT_NS
         elif result == DENIED and stream.rate_hz > NEEDED_IMU_HZ:
@@ -195,15 +199,17 @@ class MessageIntervals:
             stream.settled, stream.answer, stream.next_ns = True, "rejects it", now_ns + RETRY_PERIOD_NS
 
     def _renew(self, stream: _Stream, now_ns: int) -> None:
-        """Request a message again some time after it was rejected, or when its rate fell."""
-        if not stream.settled or now_ns < stream.next_ns:
+        """Request a message again when its rate fell, and some time after it was rejected or did not reach its rate."""
+        if not stream.settled:
             return
-        rate = self._rates[stream.name]
-        fell = rate.hz is not None and rate.hz < LOW_SHARE * stream.rate_hz
-        if fell and not stream.answer:
+        hz = self._rates[stream.name].hz
+        low = hz is not None and hz < LOW_SHARE * stream.rate_hz
+        stream.arrived |= not (low or hz is None or stream.answer)
+        if not (low or stream.answer) or (now_ns < stream.next_ns and not stream.arrived):
+            return
+        if not stream.answer:
             self._counts[f"message interval renewed: {stream.name}"] += 1
-        stream.settled = not (fell or stream.answer)
-        stream.next_ns = now_ns if not stream.settled else now_ns + RETRY_PERIOD_NS
+        stream.settled, stream.next_ns = False, now_ns
 
     def imu_rate_hz(self) -> float | None:
         """Rate at which IMU messages arrive; None: not measured yet."""

@@ -88,6 +88,39 @@ def test_any_message_with_a_time_since_boot_shows_a_boot_and_what_was_known_befo
     assert autopilot.attitude is autopilot.position is None
 
 
+def test_a_boot_is_seen_in_the_replies_to_timesync():
+    """After a boot ArduPilot sends heartbeats and these alone, until the messages are requested again."""
+    link, now_ns, device_ns = Autopilot(), [HOST0], [600 * 1000 * MS]
+    session = link.open_session(VirtualConnection(), lambda: now_ns[0], threaded=False)
+    mav = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+
+    def run(seconds: float) -> int:
+        for _ in range(round(20 * seconds)):
+            now_ns[0], device_ns[0] = now_ns[0] + 50 * MS, device_ns[0] + 50 * MS
+            session.tick()
+            sent = [parse_frame(record.data) for record in session.sent()]
+            asked = [m.ts1 for m in sent if m.get_type() == "TIMESYNC"]
+            answers = [mavlink.MAVLink_timesync_message(device_ns[0], ts1) for ts1 in asked]
+            for answer in (mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 3, 3), *answers):
+                list(session.receive(packed(answer, mav), PEER, now_ns[0]))
+        return session.counters.get("message intervals restarted", 0)
+
+    before = run(10)
+    device_ns[0] = 0
+    assert run(2) == before + 1
+    assert run(10) == before + 1
+
+
+def test_times_of_timesync_and_of_messages_are_not_compared():
+    """A device may send another time in its replies."""
+    autopilot = AutopilotEstimate()
+    for boot_ms in range(60_000, 60_400, 100):
+        assert autopilot.add(attitude(boot_ms, 30.0), HOST0) is None
+        assert autopilot.on_timesync(1_760_000_000_000 + boot_ms) is None
+    assert autopilot.on_timesync(1_000) is EstimateEvent.BOOTED
+    assert autopilot.add(attitude(1_100, 30.0), HOST0) is None
+
+
 def test_one_that_is_not_finite_is_ignored():
     assert events([attitude(1000, 30.0), attitude(1100, math.nan), attitude(1200, 30.0)]) == [None] * 3
 

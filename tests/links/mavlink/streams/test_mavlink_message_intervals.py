@@ -148,17 +148,36 @@ def test_a_busy_autopilot_is_asked_again_after_a_second():
     assert [message_id for message_id, _ in peer.run(0.5).requests].count(RAW_IMU) == 2
 
 
-def test_a_rate_that_falls_after_the_acknowledgement_is_requested_again_and_reported():
+def test_a_rate_that_falls_after_the_acknowledgement_is_requested_again_at_once():
+    """As after REQUEST_DATA_STREAM of another station, which MAVProxy sends every 15 s."""
+    peer = Peer(intervals()).run(15)
+    assert len(peer.requests) == 4
+    for _ in range(3):
+        peer.interval_us = dict.fromkeys(peer.interval_us, 250_000.0)
+        peer.run(2.5)
+        assert peer.interval_us == {RAW_IMU: 20_000, ATTITUDE: 40_000, POSITION: 40_000, ESTIMATOR: 250_000}
+        peer.run(12.5)
+    assert peer.intervals.counters["message interval renewed: RAW_IMU"] == 3
+    assert len(peer.requests) == 13
+    assert peer.intervals.status is None
+
+
+def test_a_message_that_does_not_reach_its_rate_is_reported_and_seldom_requested_again():
+    """As where the link is too slow."""
     peer = Peer(intervals(attitude_hz=0, position_hz=0, estimator_hz=0)).run(15)
-    assert len(peer.requests) == 1
-    peer.factor = 25.0  # 2 Hz, as after REQUEST_DATA_STREAM of another station
+    peer.factor = 25.0
     peer.run(5)
     assert "RAW_IMU arrives at 2.0 Hz, at least 10 Hz are needed; the autopilot accepted more" in (
         peer.intervals.status or ""
     )
-    peer.run(10)
-    assert peer.intervals.counters["message interval renewed: RAW_IMU"] >= 1
-    assert len(peer.requests) >= 2
+    assert len(peer.requests) == 2
+    assert 4 <= len(peer.run(30).requests) <= 5
+
+
+def test_a_message_once_a_second_is_not_taken_for_one_that_fell():
+    peer = Peer(MessageIntervals(MessageRates(), "ardupilot", (1, 1), (1, 197), least_gps_hz=1.0))
+    peer._kinds[24] = lambda: mavlink.MAVLink_gps_raw_int_message(0, 3, 0, 0, 0, 0, 0, 0, 0, 9)
+    assert len(peer.run(60).requests) == 5
 
 
 def test_after_a_boot_or_a_silence_the_requests_start_again():

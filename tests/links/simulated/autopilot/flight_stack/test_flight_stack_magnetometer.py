@@ -51,3 +51,15 @@ def test_the_errors_are_those_of_a_compass_on_a_multicopter():
     assert 5.0 < np.std(turned) < 14.0
     assert 2.5 < np.std(thrust) < 8.0
     assert np.std(calm) < 0.8
+
+
+def test_the_reported_field_is_the_mean_since_the_last_reading():
+    """The drone turns by 1 rad/s: the mean of 0.1 s is 50 ms old when it is read, and stays until the next."""
+    magnetometer, reported = Magnetometer(CompassSettings(**EXACT), 1), list[float]()
+    for tick in range(400):
+        magnetometer.sample(tick / 400, rotation_z(tick / 400), 1.0)
+        reported.append(-math.atan2(magnetometer.field_ut[1], magnetometer.field_ut[0]))
+    assert len(set(reported)) == 10
+    behind = np.arange(400) / 400 - reported
+    assert 0.03 < behind[200:].min() < 0.06
+    assert 0.13 < behind[200:].max() < 0.16

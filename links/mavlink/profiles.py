@@ -193,8 +193,8 @@ def _ardupilot_yaw(yaw: YawOutput, own: str) -> tuple[RequiredParameter, ...]:
     )
 
 
-def _ardupilot(yaw: YawOutput, source_set: int) -> tuple[RequiredParameter, ...]:
-    own = f"EK3_SRC{source_set}_"
+def _other_sets(source_set: int) -> tuple[RequiredParameter, ...]:
+    """Of the source sets without grd."""
     without_grd = "set 1 flies without grd"
     other = (
         RequiredParameter("EK3_SRC1_POSXY", (GPS, 0.0), why=f"{without_grd}: GPS, or none where there is no GPS"),
@@ -217,6 +217,11 @@ def _ardupilot(yaw: YawOutput, source_set: int) -> tuple[RequiredParameter, ...]
         RequiredParameter(spare + "VELXY", (3.0, 0.0, 4.0, 5.0, 7.0), why=not_grd),
         RequiredParameter(spare + "YAW", (1.0, 2.0, 3.0, 8.0), why=f"as set 1: {hit_by_mistake}"),
     )
+    return *other, *spare_set
+
+
+def _ardupilot(yaw: YawOutput, source_set: int) -> tuple[RequiredParameter, ...]:
+    own = f"EK3_SRC{source_set}_"
     return (
         RequiredParameter("AHRS_EKF_TYPE", (3.0,), why="only EKF3 fuses an external pose"),
         RequiredParameter("EK3_ENABLE", (1.0,), why="EKF3 must run"),
@@ -237,7 +242,7 @@ def _ardupilot(yaw: YawOutput, source_set: int) -> tuple[RequiredParameter, ...]
             why="without a position in set 1 the switch sets the height to grd's, and the barometer would pull it back",
         ),
         *_ardupilot_yaw(yaw, own),
-        *((*other, *spare_set) if source_set != 1 else ()),
+        *(_other_sets(source_set) if source_set != 1 else ()),
         RequiredParameter(
             "ARMING_CHECK",
             bits_off=1 | VISUAL_ODOMETRY_CHECK,

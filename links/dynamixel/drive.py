@@ -104,6 +104,8 @@ class Drive:
         write = self._bus.write
         write(mx28.BUS_WATCHDOG, 0)
         position_ticks = self.measure().position_ticks
+        if not mx28.TORQUE_ENABLE.value(health.data, HEALTH_BLOCK):
+            self._check_position(position_ticks)
         low, high = self._servo_limits
         self.goal_ticks = min(max(position_ticks, low), high)
         write(
@@ -159,6 +161,18 @@ class Drive:
             raise SetupError(
                 f"the servo with id {self._settings.servo_id} has model number {model}, an MX-28 with the 2.0 firmware "
                 f"has {mx28.MODEL} (29 is one with the 1.0 firmware: update it with DYNAMIXEL Wizard). Is `id` right?"
+            )
+
+    def _check_position(self, position_ticks: int) -> None:
+        """With torque a servo counts within one turn: just below 0 it is at 360 deg, and would turn back all of it."""
+        counted_ticks = position_ticks % mx28.STEPS_PER_TURN
+        low, high = self._settings.limit_ticks
+        if not low - ARRIVED_TICKS <= counted_ticks <= high + ARRIVED_TICKS:
+            degrees = [mx28.TICK_RAD * math.degrees(ticks) for ticks in (counted_ticks, low, high)]
+            raise SetupError(
+                "the servo is at {:.1f} deg, outside limits_deg {:.0f} to {:.0f}, and would turn the wrong way. Switch "
+                "it off, turn the table into the limits by hand and check its cable; mount the horn so that the limits "
+                "do not contain 0 deg (for example limits_deg: [90, 270])".format(*degrees)
             )
 
     def _enable_replies(self) -> None:

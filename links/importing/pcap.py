@@ -1,6 +1,7 @@
 """UDP datagrams of a classic libpcap capture (tcpdump, VeloView, `editcap -F pcap`).
 
 Both byte orders, microseconds and nanoseconds; Ethernet (with VLAN tags), raw IP, Linux cooked v1 and v2, loopback.
+Datagrams that are larger than a packet of the network (an Ouster's) are captured in fragments, and put together again.
 
 Source: draft-ietf-opsawg-pcap (file format); https://www.tcpdump.org/linktypes.html; RFC 791 (IPv4), RFC 768 (UDP).
 """
@@ -33,6 +34,9 @@ _ETHERTYPE_IPV4 = 0x0800
 _ETHERTYPE_VLAN = (0x8100, 0x88A8)
 _AF_INET = 2
 _PROTOCOL_UDP = 17
+_MORE_FRAGMENTS, _FRAGMENT_OFFSET = 0x2000, 0x1FFF  # the offset counts 8 bytes
+_INCOMPLETE = 64  # datagrams that are put together at a time; of more the oldest is dropped
+_FRAGMENT = "IPv4 fragment of an incomplete datagram"
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +47,7 @@ class Datagram:
     sender: str
     port: int  # destination
     payload: bytes
-    offset: int  # of its packet header in the file
+    offset: int  # of its last packet header in the file
 
 
 @dataclass(slots=True)
@@ -76,7 +80,7 @@ def read_datagrams(stream: IO[bytes], path: Path, report: PcapReport) -> Iterato
         raise LinkError(
             f"{path}: link type {link_type} is not supported: capture on an Ethernet interface (tcpdump -i eth0)"
         )
-    packet_header = struct.Struct(order + "IIII")
+    packet_header, fragments = struct.Struct(order + "IIII"), _Fragments(report.skipped)
     offset = _FILE_HEADER_BYTES
     while head := stream.read(packet_header.size):
         if len(head) < packet_header.size:
@@ -90,35 +94,77 @@ def read_datagrams(stream: IO[bytes], path: Path, report: PcapReport) -> Iterato
         if len(packet) < captured:
             report.warnings.append(f"{path}: cut off at byte {offset + 16 + len(packet)}, in the packet at {offset}")
             return
-        datagram = _datagram(packet, link_type, seconds * 1_000_000_000 + fraction * unit_ns, offset)
+        datagram = _datagram(packet, link_type, seconds * 1_000_000_000 + fraction * unit_ns, offset, fragments)
         offset += packet_header.size + captured
         report.done_bytes = offset
         if isinstance(datagram, Datagram):
             yield datagram
-        else:
+        elif datagram is not None:
             report.skipped["cut short by the capture's snapshot length" if captured < original else datagram] += 1
 
 
-def _datagram(packet: bytes, link_type: int, time_ns: int, offset: int) -> Datagram | str:
-    """The UDP datagram in a packet, or why there is none."""
+class _Fragments:
+    """Puts fragmented IPv4 datagrams together again; fragments count as skipped until theirs is complete."""
+
+    def __init__(self, skipped: Counter[str]) -> None:
+        self._skipped = skipped
+        self._parts: dict[bytes, dict[int, bytes]] = {}  # fragments by datagram and offset, the oldest datagram first
+        self._bytes: dict[bytes, int] = {}  # of datagrams whose last fragment has come
+
+    def add(self, header: bytes, data: bytes) -> bytes | None:
+        """The content of the datagram that this fragment completes."""
+        key, field = header[12:20] + header[4:6] + header[9:10], int.from_bytes(header[6:8], "big")
+        at = 8 * (field & _FRAGMENT_OFFSET)
+        if key not in self._parts and len(self._parts) == _INCOMPLETE:
+            self._drop(next(iter(self._parts)))
+        parts = self._parts.setdefault(key, {})
+        self._skipped[_FRAGMENT] += at not in parts
+        parts[at] = data
+        if not field & _MORE_FRAGMENTS:
+            self._bytes[key] = at + len(data)
+        whole = b""
+        for start in sorted(parts):
+            if start != len(whole):
+                return None
+            whole += parts[start]
+        if len(whole) != self._bytes.get(key):
+            return None
+        self._skipped[_FRAGMENT] -= len(parts)
+        if not self._skipped[_FRAGMENT]:
+            del self._skipped[_FRAGMENT]
+        self._drop(key)
+        return whole
+
+    def _drop(self, key: bytes) -> None:
+        del self._parts[key]
+        self._bytes.pop(key, None)
+
+
+def _datagram(packet: bytes, link_type: int, time_ns: int, offset: int, fragments: _Fragments) -> Datagram | str | None:
+    """The UDP datagram that a packet contains or completes, why there is none, or None for a fragment."""
     start = _ipv4_start(packet, link_type)
     if start is None:
         return "not IPv4"
     if len(packet) < start + 20 or packet[start] >> 4 != 4:
         return "damaged IPv4 header"
-    udp = start + (packet[start] & 0x0F) * 4
+    header_bytes = (packet[start] & 0x0F) * 4
     total, fragment = struct.unpack_from(">H2xH", packet, start + 2)
-    if fragment & 0x3FFF:  # more fragments follow, or this is not the first
-        return "IPv4 fragment"
     if packet[start + 9] != _PROTOCOL_UDP:
         return "not UDP"
-    if len(packet) < udp + 8:
+    content: bytes | None = packet[start + header_bytes : start + total]
+    if fragment & (_MORE_FRAGMENTS | _FRAGMENT_OFFSET):
+        if len(packet) < start + total or total <= header_bytes:
+            return "damaged IPv4 fragment"
+        content = fragments.add(packet[start : start + 20], content)
+        if content is None:
+            return None
+    if len(content) < 8:
         return "damaged UDP header"
-    port, length = struct.unpack_from(">HH", packet, udp + 2)
-    if length < 8 or udp + length > len(packet) or udp + length > start + total:
+    port, length = struct.unpack_from(">HH", content, 2)
+    if not 8 <= length <= len(content):
         return "damaged UDP header"
     sender = str(ipaddress.IPv4Address(packet[start + 12 : start + 16]))
-    return Datagram(time_ns, sender, port, packet[udp + 8 : udp + length], offset)
+    return Datagram(time_ns, sender, port, content[8:length], offset)
 
 
 def _ipv4_start(packet: bytes, link_type: int) -> int | None:

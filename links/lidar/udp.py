@@ -148,4 +148,7 @@ def _timeout_text(port: int, sender: str | None, timeout_s: float, foreign: int,
             f"no packet from {sender} on UDP {port} for {timeout_s:g} s, but {foreign} from others "
             f"(last {last_foreign}): is `sender` the LiDAR's address?"
         )
-    return f"no packet on UDP {port} for {timeout_s:g} s: is the LiDAR powered, and is this host on its subnet?"
+    return (
+        f"no packet on UDP {port} for {timeout_s:g} s: is the LiDAR powered, and is this host on its subnet? "
+        "If it broadcasts, set this host as its destination, or `bind: 0.0.0.0`."
+    )

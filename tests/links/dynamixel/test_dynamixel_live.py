@@ -483,6 +483,23 @@ def test_a_servo_that_must_not_be_driven_is_an_error_that_names_the_setting(emul
     assert emulator.get(mx28.TORQUE_ENABLE) == 0
 
 
+@pytest.mark.parametrize("start_deg", [-2.6, 185.0, 357.4])
+def test_a_servo_outside_its_limits_gets_no_torque(start_deg: float):
+    """Just below 0 deg it would count from 360 deg, and turn back by that."""
+    with DynamixelEmulator(ServoSettings(travel_deg=(0.0, 360.0), start_deg=start_deg)) as emulator:
+        with pytest.raises(LinkError, match="outside limits_deg 0 to 180"), live(emulator).listen() as records:
+            until(records, lambda _: False)
+        assert emulator.get(mx28.TORQUE_ENABLE) == 0
+
+
+def test_a_servo_that_holds_its_position_just_below_0_deg_is_driven():
+    """As after a restart of the process: it has torque, and goes on counting."""
+    with DynamixelEmulator(ServoSettings(travel_deg=(0.0, 360.0), start_deg=-0.2)) as emulator:
+        emulator.set(mx28.TORQUE_ENABLE, 1)
+        with live(emulator).listen() as records:
+            until(records, lambda _: emulator.get(mx28.BUS_WATCHDOG) > 0)
+
+
 def test_with_write_settings_the_settings_are_corrected_and_kept(emulator):
     emulator.set(mx28.RETURN_DELAY_TIME, 250)
     emulator.set(mx28.OPERATING_MODE, 4)

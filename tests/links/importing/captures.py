@@ -16,13 +16,25 @@ def ipv4(
     *,
     protocol: int = 17,
     fragment: int = 0,
+    number: int = 1,
     options: bytes = b"",
     sender: tuple[int, int, int, int] = (192, 168, 1, 201),
 ) -> bytes:
     """An IPv4 packet."""
     words = 5 + len(options) // 4
-    head = struct.pack(">BBHHHBBH", 0x40 | words, 0, 4 * words + len(content), 1, fragment, 64, protocol, 0)
+    head = struct.pack(">BBHHHBBH", 0x40 | words, 0, 4 * words + len(content), number, fragment, 64, protocol, 0)
     return head + bytes(sender) + bytes([255] * 4) + options + content
+
+
+def fragments(payload: bytes, number: int, most: int = 1480) -> list[bytes]:
+    """The Ethernet frames of a UDP datagram that is larger than a packet, in order; `number`: its identification."""
+    datagram = struct.pack(">HHHH", 2368, 2368, 8 + len(payload), 0) + payload
+    starts = range(0, len(datagram), most)
+    more = [0x2000 * (start + most < len(datagram)) for start in starts]
+    return [
+        ethernet(ipv4(datagram[start : start + most], fragment=start // 8 | flag, number=number))
+        for start, flag in zip(starts, more, strict=True)
+    ]
 
 
 def ethernet(packet: bytes, ethertype: int = 0x0800, vlans: tuple[int, ...] = ()) -> bytes:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from captures import ethernet, ipv4, pcap, times_ns, udp
+from captures import ethernet, fragments, ipv4, pcap, times_ns, udp
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -108,7 +108,7 @@ def test_other_packets_are_counted_by_reason(tmp_path: Path):
         ethernet(bytes(40), ethertype=0x0806),
         ethernet(ipv4(bytes(20), protocol=6)),
         ethernet(ipv4(bytes(800), fragment=0x2000)),
-        ethernet(ipv4(bytes(430), fragment=100)),
+        ethernet(ipv4(bytes(430), fragment=101)),
         ethernet(ipv4(b"abc")),
         ethernet(udp(PACKETS[2]))[:-4],
         ethernet(b"\x65" + bytes(30)),
@@ -117,13 +117,32 @@ def test_other_packets_are_counted_by_reason(tmp_path: Path):
     assert len(records) == 1
     assert report.skipped == {
         "on UDP port 53": 2,
-        "IPv4 fragment": 2,
+        "IPv4 fragment of an incomplete datagram": 2,
         "damaged UDP header": 2,
         "on UDP port 2368": 1,
         "not IPv4": 1,
         "not UDP": 1,
         "damaged IPv4 header": 1,
     }
+
+
+def test_fragments_are_put_together_in_any_order_and_each_datagram_once(tmp_path: Path):
+    """Of datagrams that are interleaved, with a repeated fragment, and with one that is missing."""
+    a, b, c, d = (fragments(packet, number, most=400) for number, packet in enumerate(PACKETS))
+    assert [len(parts) for parts in (a, b, c, d)] == [4] * 4
+    frames = [a[0], b[2], a[1], b[0], a[1], a[2], b[3], a[3], *c[:2], c[3], b[1], *reversed(d)]
+    report, records = run(tmp_path, pcap(frames))
+    assert [r.data for r in records] == [PACKETS[0], PACKETS[1], PACKETS[3]]
+    assert [r.arrival_ns for r in records] == [times_ns(len(frames), 1000)[k] for k in (7, 11, 15)]
+    assert report.skipped == {"IPv4 fragment of an incomplete datagram": 3}
+
+
+def test_incomplete_datagrams_are_dropped_the_oldest_first(tmp_path: Path):
+    first, *others = (fragments(PACKETS[0], number, most=800) for number in range(70))
+    frames = [*(parts[0] for parts in (first, *others)), first[1], others[-1][1], ethernet(udp(PACKETS[1]))]
+    report, records = run(tmp_path, pcap(frames))
+    assert [r.data for r in records] == PACKETS[:2]
+    assert report.skipped == {"IPv4 fragment of an incomplete datagram": 70}
 
 
 def test_a_packet_cut_by_the_snapshot_length_is_counted_as_that(tmp_path: Path):

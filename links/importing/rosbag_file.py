@@ -37,7 +37,7 @@ from links.ros.mapping import (
     guess,
 )
 from links.ros.point_cloud import FAR_M, MIN_FAR, CloudEncoder
-from links.ros.streams import ServoReader, image_records, odometry_records, stamp_ns
+from links.ros.streams import ServoReader, image_records, odometry_records, stamp_ns, time_ns
 from stages.geometry.rig_lidar import RigLidar
 
 HOUR_NS = 3_600_000_000_000
@@ -156,6 +156,8 @@ class RosbagFile(ImportedFile):
         payloads: list[tuple[Any, bytes]] = []
         for stamp, payload in _payloads(message.value):
             form = self._model.of(payload)
+            if not form.is_data(payload) and form.is_data(payload[:-1]):
+                payload = payload[:-1]  # ouster-ros before 2023 adds one byte
             if form.is_data(payload):
                 self._model.check(payload, f"on {message.topic}")
                 payloads.append((stamp, payload))
@@ -164,7 +166,7 @@ class RosbagFile(ImportedFile):
                 self._not_data = self._not_data or (payload, message.topic)
         if self._model.form is None and payloads:
             raise LinkError(f"{self._source}: {message.topic}: packets of a LiDAR that grd does not know")
-        by_recording = use.stamp == "arrival"
+        by_recording = use.stamp == "arrival" or all(_is_unset(stamp) for stamp, _ in payloads)
         before = _before_last_ns(self._model.form, payloads) if by_recording and self._model.form else []
         for k, (stamp, payload) in enumerate(payloads):
             arrival_ns = message.time_ns - before[k] if by_recording else stamp_ns(message, use, stamp)
@@ -223,6 +225,11 @@ def _payloads(value: Any) -> Iterator[tuple[Any, bytes]]:
     for packet in value.packets:
         data = bytes(packet.data)
         yield packet.stamp, data[: int(packet.size)] if hasattr(packet, "size") else data
+
+
+def _is_unset(stamp: Any) -> bool:
+    """Whether a packet's own time is zero: hesai_ros_driver sets only that of the frame."""
+    return stamp is not None and time_ns(stamp) == 0
 
 
 def _before_last_ns(form: AnyFormat, payloads: list[tuple[Any, bytes]]) -> list[int]:

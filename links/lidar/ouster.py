@@ -106,6 +106,16 @@ class OusterFormat(PacketFormat):
         assert at is not None
         return int.from_bytes(data[at : at + 8], "little") // 1_000 % HOUR_US
 
+    def first_pulse_ns(self, arrival_ns: int, data: bytes) -> int:
+        """See PacketFormat: of the first valid column, as `timestamp_us`. Those before it lie outside the window."""
+        start_ns = super().first_pulse_ns(arrival_ns, data)
+        if not self.is_data(data):
+            return start_ns
+        at = self._first_column_at(data)
+        assert at is not None
+        column = (at - self.entries.packet_head_bytes) // int(self.layout[columns.BLOCK_BYTES])
+        return start_ns + round(column * self.column_ns)
+
     def duration_ns(self, data: bytes) -> int:
         """See PacketFormat."""
         del data

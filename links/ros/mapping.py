@@ -25,7 +25,7 @@ from links.ros.bag import BagTopic
 LIDAR, SERVO, VEHICLE_CAMERA, DRONE_CAMERA = "/lidar/packets", "/servo/state", "/camera/vehicle", "/camera/drone"
 ODOMETRY, AUTOPILOT = "/vehicle/odometry", "/autopilot/rx"
 POINTS = "sensor_msgs/msg/PointCloud2"
-OUSTER_PACKETS = ("ouster_ros/msg/PacketMsg", "ouster_sensor_msgs/msg/PacketMsg")
+OUSTER_PACKETS = ("ouster_ros/msg/PacketMsg", "ouster_msgs/msg/PacketMsg", "ouster_sensor_msgs/msg/PacketMsg")
 SCANS = (
     "velodyne_msgs/msg/VelodyneScan",
     "pandar_msgs/msg/PandarScan",

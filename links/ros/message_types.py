@@ -36,11 +36,12 @@ DEFINITIONS = {
     "velodyne_msgs/msg/VelodyneScan": _SCAN.format(package="velodyne_msgs", packet="VelodynePacket"),
     "pandar_msgs/msg/PandarPacket": f"{_STAMPED}uint8[1500] data\nuint32 size\n",
     "pandar_msgs/msg/PandarScan": _SCAN.format(package="pandar_msgs", packet="PandarPacket"),
-    "hesai_ros_driver/msg/UdpPacket": f"{_STAMPED}uint32 size\nuint8[1500] data\n",
+    "hesai_ros_driver/msg/UdpPacket": f"{_STAMPED}uint8[] data\nuint32 size\n",
     "hesai_ros_driver/msg/UdpFrame": "std_msgs/Header header\nhesai_ros_driver/UdpPacket[] packets\n",
     "nebula_msgs/msg/NebulaPacket": f"{_STAMPED}uint8[] data\n",
     "nebula_msgs/msg/NebulaPackets": _SCAN.format(package="nebula_msgs", packet="NebulaPacket"),
     "ouster_ros/msg/PacketMsg": "uint8[] buf\n",
+    "ouster_msgs/msg/PacketMsg": "uint8[] buf\n",
     "ouster_sensor_msgs/msg/PacketMsg": "uint8[] buf\n",
     "mavros_msgs/msg/Mavlink": _MAVLINK,
 }

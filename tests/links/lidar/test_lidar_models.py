@@ -11,6 +11,7 @@ import subprocess
 from collections.abc import Iterator
 from os import environ
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,6 +33,7 @@ from links.simulated.sensors.lidar_packets import PacketEncoder
 from stages.aim.beams import Rotor
 from stages.geometry.lidar_models import LIDAR_MODELS, lidar_profile
 from stages.geometry.rig_lidar import RigLidar
+from stages.kernels.lidar import packets as layout
 from stages.messages import LidarFirings
 from tests.links.ports import free_port
 
@@ -149,6 +151,23 @@ def test_columns_of_an_ouster_keep_their_own_times():
     columns = firings.pulse_stamp_ns.reshape(16, 32)
     assert (columns == columns[:, :1]).all()
     assert np.diff(columns[:, 0]).mean() == pytest.approx(1e8 / 1024, rel=0.01)
+
+
+@pytest.mark.parametrize("name", ["OS-1-32-G_v2.1.1_1024x10", "OS-0-32-U1_v2.2.0_1024x10"])
+def test_the_first_pulse_of_an_ousters_packet_is_that_of_its_first_valid_column(name: str):
+    """As at the edge of an azimuth window: the time of the sensor is that of the same column."""
+    model, beams = ouster_beams((OTHER / f"{name}.json").read_text(), name)
+    form: Any = Lidar(unit=RigLidar(model=model, beams=beams)).form
+    with (OTHER / f"{name}.pcap").open("rb") as stream:
+        whole = next(d.payload for d in read_datagrams(stream, OTHER, PcapReport()) if form.is_data(d.payload))
+    edge, at_ns = bytearray(whole), 10**12
+    for column in range(5):
+        head = form.entries.packet_head_bytes + column * int(form.layout[layout.BLOCK_BYTES])
+        edge[head + int(form.layout[layout.STATUS_IN_BLOCK])] &= 0xFE
+    later_ns = form.first_pulse_ns(at_ns, bytes(edge)) - form.first_pulse_ns(at_ns, whole)
+    later_us = form.timestamp_us(bytes(edge)) - form.timestamp_us(whole)
+    assert later_ns == pytest.approx(5 * 1e9 / 10 / 1024, abs=2)
+    assert later_us == pytest.approx(1e-3 * later_ns, abs=10)
 
 
 def test_packets_of_another_ouster_are_refused_by_its_serial_number():

@@ -188,6 +188,36 @@ def test_real_hesai_bags_name_their_model(tmp_path: Path, name: str, model: str,
     assert all(b.arrival_ns >= a.arrival_ns for a, b in itertools.pairwise(records))
 
 
+def test_packets_of_hesais_driver_have_the_time_of_recording(tmp_path: Path):
+    """It sets the time of the frame alone, in the sensor's clock; here the frame has packets of a VLP-16."""
+    entries: list[Entry] = []
+    for _, _, at_ns, values in scans():
+        packets = [{"data": packet["data"], "size": 1206} for packet in values["packets"]]
+        entries.append(
+            ("/lidar_packets", "hesai_ros_driver/msg/UdpFrame", at_ns, {"header": header(7), "packets": packets})
+        )
+    _, records, _ = imported(tmp_path, write_bag(tmp_path / "bag", entries))
+    assert [r.data for r in records] == [r.data for r in PACKETS]
+    late_ns = np.array([a.arrival_ns - b.arrival_ns for a, b in zip(records, PACKETS, strict=True)])
+    assert (np.abs(late_ns - 100_000) < 20_000).all()
+
+
+@pytest.mark.skipif(not OTHER.is_dir(), reason="the shared data are not here")
+@pytest.mark.parametrize("package", ["ouster_ros", "ouster_msgs", "ouster_sensor_msgs"])
+def test_packets_of_an_older_ouster_driver_have_one_byte_more(tmp_path: Path, package: str):
+    from links.importing.pcap import PcapReport, read_datagrams
+
+    name, kind = OTHER / "OS-0-32-U1_v2.2.0_1024x10", f"{package}/msg/PacketMsg"
+    with name.with_name(f"{name.name}.pcap").open("rb") as stream:
+        datagrams = [d for d in read_datagrams(stream, name, PcapReport()) if len(d.payload) == 8448]  # no IMU
+    entries: list[Entry] = [("/ouster/lidar_packets", kind, d.time_ns, {"buf": [*d.payload, 0]}) for d in datagrams]
+    metadata = name.with_name(f"{name.name}.json").read_text()
+    entries.insert(0, ("/ouster/metadata", STRING, datagrams[0].time_ns, {"data": metadata}))
+    _, records, _ = imported(tmp_path, write_bag(tmp_path / "bag", entries))
+    assert [r.data for r in records] == [d.payload for d in datagrams]
+    assert len(records) == 64
+
+
 @pytest.mark.skipif(not OTHER.is_dir(), reason="the shared data are not here")
 def test_an_ouster_is_known_by_the_metadata_in_the_bag_and_refused_without(tmp_path: Path):
     from links.importing.pcap import PcapReport, read_datagrams

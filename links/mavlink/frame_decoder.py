@@ -4,7 +4,8 @@ Each frame is decoded on its own, so a damaged one does not affect the next. Dam
 counted and skipped; no received bytes raise an exception.
 
 Each position, velocity and attitude is marked with whether it is independent of the poses that we sent
-(`independence.py`). In replay the sent frames are on a topic of their own.
+(`independence.py`). In replay the sent frames are on a topic of their own. Positions that PX4 sends without aiding are
+rejected (`poses/autopilot_estimate.py`).
 
 Source: https://mavlink.io/en/messages/common.html; the handling of late, lost and repeated frames is ours.
 """
@@ -17,6 +18,7 @@ from typing import Any
 
 from flow.link import Record
 from links.clock.device_clock import DeviceClock
+from links.mavlink.poses.autopilot_estimate import position_is_aided
 from links.mavlink.poses.independence import Independence
 from links.mavlink.poses.odom_frame import read_odom_frame
 from links.mavlink.readers import READERS, TIMELESS_READERS, AutopilotMessage, is_ranging_radio
@@ -37,6 +39,7 @@ CRITICAL = 5  # MAV_STATE_CRITICAL; above: emergency, poweroff, termination
 FOREIGN_TIMESYNC = "TIMESYNC for another component"  # reason in `rejected`
 ESTIMATES = (DroneAttitude, DroneLocalPosition, DroneOdometry, DroneGlobalPosition)
 ARRIVAL_STAMPED = "GPS_RAW_INT"  # its time is that of the last fix, long ago without one, or since 1970: no clock
+POSITIONS = frozenset({"LOCAL_POSITION_NED", "ODOMETRY", "GLOBAL_POSITION_INT"})
 LATE = 128  # a sequence number this far ahead is a late frame, not 128 lost frames
 
 
@@ -53,6 +56,7 @@ class FrameDecoder:
         self._last_ns: dict[str, int] = {}  # stamp of the newest message per type
         self._late: int | None = None  # an older sequence number, received immediately before
         self._imu = ImuSelection()
+        self._aided = True
         self._matched = False  # replies to our TIMESYNC are recorded with the request's time as stamp
 
     def decode(self, record: Record) -> AutopilotMessage | EarlierOdomFrame | None:
@@ -82,6 +86,10 @@ class FrameDecoder:
         if timeless is not None:
             self.decoded += 1
             return timeless(frame, record.arrival_ns)
+        aided = position_is_aided(frame)
+        self._aided = self._aided if aided is None else aided
+        if kind in POSITIONS and not self._aided:
+            return self._reject("position without aiding")
         reader = READERS.get(kind)
         used = is_ranging_radio(frame) if kind == "DISTANCE_SENSOR" else self._imu.accepts(kind, record.arrival_ns)
         if reader is None or not used:

@@ -9,7 +9,11 @@ The thresholds are those of a real flight without a reset: over 1998 intervals o
 
 Boots: time since boot that runs backwards, in any message that has it. Frames that arrive late run back by less.
 
-Source: ours; https://mavlink.io/en/messages/common.html#ATTITUDE.
+Without aiding ArduPilot sends no position. PX4 sends one all the same, dead-reckoned or held; its ESTIMATOR_STATUS then
+lacks ESTIMATOR_PRED_POS_HORIZ_REL (256).
+
+Source: ours; https://mavlink.io/en/messages/common.html#ATTITUDE; PX4 mavlink/streams/LOCAL_POSITION_NED.hpp and
+ODOMETRY.hpp, Ekf::get_ekf_soln_status (pred_pos_horiz_rel: isHorizontalAidingActive).
 """
 
 from __future__ import annotations
@@ -22,6 +26,7 @@ from typing import Any
 import numpy as np
 
 from links.mavlink.ned_frd import flip_yz
+from links.mavlink.readers import PREDICTED_RELATIVE
 from stages.geometry.frames import Array64
 
 MIN_YAW_RESET_RAD, UNEXPLAINED_SHARE = math.radians(8.0), 0.3  # unexplained change of yaw, and share of the turn
@@ -30,6 +35,11 @@ MIN_BOOT_STEP_MS = 1000  # time since boot that runs backwards by more is anothe
 STEEP_RAD = math.radians(60.0)  # pitch or roll beyond which yaw is not evaluated
 MAX_ATTITUDE_AGE_NS = 1_000_000_000  # of its attitude against a pose
 MAX_POSITION_AGE_NS = 300_000_000  # of its position against a pose; it is extrapolated by its velocity
+
+
+def position_is_aided(message: Any) -> bool | None:
+    """What a status of PX4's EKF says of the position that it sends; None: another message."""
+    return bool(message.flags & PREDICTED_RELATIVE) if message.get_type() == "ESTIMATOR_STATUS" else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,9 +82,12 @@ class AutopilotEstimate:
         self._newest_ms: dict[str, int] = {}  # time since boot: of any message, and of replies to TIMESYNC
         self._attitude_ms = 0  # the same of the attitude
         self._yaw_rate = 0.0
+        self._aided = True
 
     def add(self, message: Any, arrival_ns: int) -> EstimateEvent | None:
         """Add a message; a late one, and values that are not finite, are ignored."""
+        aided = position_is_aided(message)
+        self._aided = self._aided if aided is None else aided
         boot_ms = getattr(message, "time_boot_ms", None)
         if boot_ms is None:
             return None
@@ -82,7 +95,7 @@ class AutopilotEstimate:
         kind, yaw_reset = message.get_type(), False
         if kind == "ATTITUDE":
             yaw_reset = self._add_attitude(message, arrival_ns)
-        elif kind == "LOCAL_POSITION_NED":
+        elif kind == "LOCAL_POSITION_NED" and self._aided:
             values = np.array([message.x, message.y, message.z, message.vx, message.vy, message.vz])
             if np.isfinite(values).all():
                 self.position = AutopilotPosition(arrival_ns, flip_yz(values[:3]), flip_yz(values[3:]))

@@ -5,7 +5,8 @@ is rejected. Neither says which source is meant, so the ratio counts only while 
 
     while ArduPilot is known to use another source set than grd's: it is that of GPS
     above 1 while a GPS glitch is reported. ArduPilot reports one only while it uses GPS; that of PX4 is the larger one
-        of GPS and grd. PX4 may keep the flag after it has stopped GPS; a rejection is then not seen
+        of GPS and grd. PX4 may keep the flag after it has stopped GPS; a rejection is then not seen. PX4 1.14 and 1.15
+        set it only while the compass is rejected, too: `report` is better there with GPS
 
 On grd's set the ratio of the compass is the larger one of the yaw that grd sends and of the compass before the switch,
 which is kept. ArduPilot rejects a wrong yaw for the rest of the flight, also after a reset, which is one of the

@@ -29,6 +29,7 @@ from links.simulated.autopilot.rules import (
 )
 
 mavlink: Any = ardupilotmega
+OWN_POSITION = 256  # ESTIMATOR_PRED_POS_HORIZ_REL: the scripted telemetry is of another sensor
 
 
 @dataclass(slots=True)
@@ -62,7 +63,7 @@ class Px4Rules(Rules):
         """ESTIMATOR_STATUS."""
         position, yaw = self.ratios
         return mavlink.MAVLink_estimator_status_message(
-            now_ns // US, self._flags(now_ns), 0.0, position, position, yaw, 0.0, 0.0, 0.1, 0.1
+            now_ns // US, self._flags(now_ns) | OWN_POSITION, 0.0, position, position, yaw, 0.0, 0.0, 0.1, 0.1
         )
 
     def _process(self, message: Any, now_ns: int) -> PoseResult:

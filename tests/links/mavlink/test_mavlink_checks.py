@@ -223,9 +223,11 @@ def test_the_clock_drift_is_reported_if_known():
         ("measured", estimator(attitude=False, position=False), Level.WARNING, "normal without compass"),
         ("measured", estimator(attitude=False, ratio=1.6), Level.FAIL, "rejects velocity"),
         ("none", estimator(attitude=False), Level.FAIL, "no attitude yet"),
+        ("none", estimator(constant=True), Level.OK, "attitude and position good"),
+        ("none", estimator(position=False), Level.WARNING, "no position"),
     ],
 )
-def test_px4_without_compass_has_no_yaw_before_poses(yaw, estimates, level, text):
+def test_what_the_estimator_of_px4_reports_before_poses(yaw, estimates, level, text):
     link = Autopilot(connection="udpin:127.0.0.1:0", profile="px4", yaw=yaw)
     result = _estimate("it", link, [estimates])
     assert (result.level, text in result.sentence) == (level, True)

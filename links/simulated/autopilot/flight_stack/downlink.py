@@ -103,10 +103,10 @@ class Downlink:
 def _message(
     message: int, device_ns: int, ekf: Estimators, estimate: Array64, sample: Array64, field_ut: Array64
 ) -> Any:
-    """One message by its id; None: not known now. EKF3 reports no position in constant position mode."""
+    """One message by its id; None: not known now. EKF3 reports no position in constant position mode, EKF2 does."""
     core = ekf.reported
     gyro = sample[0:3] - core.lane.x[10:13]
-    known = core.aiding and core.origin
+    known = (core.aiding and core.origin) or ekf.px4
     if message == streams.ATTITUDE:
         return telemetry.attitude(device_ns, estimate, gyro)
     if message == streams.LOCAL_POSITION_NED:

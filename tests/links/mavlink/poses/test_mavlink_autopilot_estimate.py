@@ -121,6 +121,14 @@ def test_times_of_timesync_and_of_messages_are_not_compared():
     assert autopilot.add(attitude(1_100, 30.0), HOST0) is None
 
 
+def test_a_position_of_px4_without_aiding_is_not_used():
+    autopilot = AutopilotEstimate()
+    for flags, used in ((1 | 8, False), (1 | 8 | 256, True)):
+        autopilot.add(mavlink.MAVLink_estimator_status_message(1_000_000, flags, *[0.1] * 4, 0, 0, 1, 1), HOST0)
+        autopilot.add(mavlink.MAVLink_local_position_ned_message(1_010, 1, 2, -3, 1, 0, 0), HOST0)
+        assert (autopilot.position is not None) == used
+
+
 def test_one_that_is_not_finite_is_ignored():
     assert events([attitude(1000, 30.0), attitude(1100, math.nan), attitude(1200, 30.0)]) == [None] * 3
 

@@ -33,6 +33,7 @@ from stages.messages import LidarFirings
 
 POSITION_TOPIC = "/lidar/position"
 MAX_CONSECUTIVE_REJECTED = 100
+BUFFERED_S = 1.2  # packets that wait in the kernel while this process is busy
 POSITION_TIMEOUT_S = 3.0  # a sensor sends several per second
 
 
@@ -95,6 +96,10 @@ class Lidar(Source[LidarSettings]):
         )
         return {topic: {**known, "port": str(port)} for topic, port in ports.items()}
 
+    def _buffer_bytes(self) -> int:
+        """For BUFFERED_S of packets; the kernel counts some twice their size."""
+        return round(2 * self.form.packet_bytes * BUFFERED_S * 1e9 / self.form.packet_ns("dual"))
+
     @contextmanager
     def listen(self) -> Iterator[PolledRecords]:
         """Receive packets: `with lidar.listen() as records`. LinkError as `listen_udp`, or without UTC lock."""
@@ -104,7 +109,7 @@ class Lidar(Source[LidarSettings]):
             raise LinkError(
                 f"clock: utc needs the sensor's position packets: set position_port: {POSITION_PORT}, or clock: free"
             )
-        channels = [Channel(settings.topic, settings.port)]
+        channels = [Channel(settings.topic, settings.port, self._buffer_bytes())]
         if settings.position_port is not None:
             channels.append(Channel(POSITION_TOPIC, settings.position_port))
         sender = None if settings.sender is None else str(settings.sender)

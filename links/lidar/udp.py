@@ -21,7 +21,7 @@ from links.clock import datagram_time
 
 FirstPulse = Callable[[int, bytes], int]  # time of the first pulse from arrival [ns] and payload
 Accepts = Callable[[Record], bool]  # LinkError: the sensor is not ready
-RECEIVE_BUFFER_BYTES = 1 << 20  # 1.2 s of a VLP-16's packets, if the host's net.core.rmem_max allows it
+RECEIVE_BUFFER_BYTES = 1 << 20  # as far as the host's net.core.rmem_max allows it
 _DATAGRAM_BYTES = 65_536  # an Ouster's packets are up to 33 kB
 
 
@@ -39,6 +39,7 @@ class Channel(NamedTuple):
 
     topic: str
     port: int
+    buffer_bytes: int = RECEIVE_BUFFER_BYTES
 
 
 @contextmanager
@@ -57,7 +58,7 @@ def listen_udp(
     `record.stamp_ns` is when the packet's first laser fired, estimated from its arrival (`first_pulse_ns`).
     """
     with ExitStack() as stack:
-        sockets = {stack.enter_context(_open(bind, channel.port)): channel for channel in channels}
+        sockets = {stack.enter_context(_open(bind, channel)): channel for channel in channels}
         packets = Packets(sockets, sender, timeout_s, counters, first_pulse_ns, accepts)
         try:
             yield packets
@@ -65,10 +66,11 @@ def listen_udp(
             packets.closed.set()
 
 
-def _open(bind: str, port: int) -> socket.socket:
+def _open(bind: str, channel: Channel) -> socket.socket:
+    port = channel.port
     udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
-        udp.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
+        udp.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, channel.buffer_bytes)
         datagram_time.enable_stamps(udp)
         udp.bind((bind, port))
     except OSError as error:

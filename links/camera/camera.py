@@ -26,6 +26,7 @@ from links.camera.live_camera import LiveCamera
 from links.recording import CompressedImage, decode_compressed_image, encode_compressed_image
 from stages.messages import Image
 
+AS_SENT = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION  # the lens is that of the unturned image
 MAX_PIXELS = 4096 * 4096  # of a frame; a larger one is rejected before memory is allocated
 SLOW_STATUS_S = 5.0  # how long the status "too slow" is kept after its last event
 FRAME_HEADERS = (0xC0, 0xC1, 0xC2)  # baseline, extended, progressive
@@ -132,7 +133,7 @@ def decode_image(stamp_ns: int, frame: CompressedImage, readout_s: float = 0.0) 
         raise ValueError(f"a frame of {width} x {height} pixels")
     if not frame.data.rstrip(b"\0").endswith(b"\xff\xd9"):
         raise ValueError("an incomplete JPEG")
-    grey = cv2.imdecode(np.frombuffer(frame.data, dtype=np.uint8), cv2.IMREAD_GRAYSCALE)
+    grey = cv2.imdecode(np.frombuffer(frame.data, dtype=np.uint8), AS_SENT)
     if grey is None:
         raise ValueError("a damaged JPEG")
     grey = np.asarray(grey, dtype=np.uint8)

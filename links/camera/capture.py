@@ -152,17 +152,18 @@ class Capture:
         s = self._settings
         if not Path(s.source).exists():
             raise CaptureLost(f"there is no {s.source}")
-        options = [cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*"MJPG"), cv2.CAP_PROP_FPS, round(s.fps)]
+        options = [cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*"MJPG")]
         if s.size_px is not None:
             options += [cv2.CAP_PROP_FRAME_WIDTH, s.size_px[0], cv2.CAP_PROP_FRAME_HEIGHT, s.size_px[1]]
-        video = cv2.VideoCapture(s.source, cv2.CAP_V4L2, [*options, cv2.CAP_PROP_CONVERT_RGB, 0])
-        if video.isOpened() and _codec(video) == "MJPG":
-            return video, True
-        video.release()
-        video = cv2.VideoCapture(s.source, cv2.CAP_V4L2, options)
-        if not video.isOpened():
-            raise CaptureLost(f"{s.source} cannot be opened as a camera")
-        return video, False
+        for rate in ([cv2.CAP_PROP_FPS, round(s.fps)], []):  # some drivers refuse any rate
+            video = cv2.VideoCapture(s.source, cv2.CAP_V4L2, [*options, *rate, cv2.CAP_PROP_CONVERT_RGB, 0])
+            if video.isOpened() and _codec(video) == "MJPG":
+                return video, True
+            video.release()
+            video = cv2.VideoCapture(s.source, cv2.CAP_V4L2, [*options, *rate])
+            if video.isOpened():
+                return video, False
+        raise CaptureLost(f"{s.source} cannot be opened as a camera")
 
     def _received_ns(self, arrival_ns: int) -> int:
         """Reception time of the grabbed image: by the stream's time stamps if they advance, otherwise its arrival."""

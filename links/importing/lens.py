@@ -39,7 +39,7 @@ def import_lens(
             "--max-off-axis-deg",
             min=1,
             max=150,
-            help="How far off axis the calibration holds [default: Kalibr 117.5, OCamCalib 100].",
+            help="How far off axis the calibration holds [default: Kalibr 85 (its points are < 90), OCamCalib 100].",
         ),
     ] = None,
     overwrite: Overwrite = False,
@@ -70,8 +70,8 @@ def import_lens(
             markup=False,
         )
     out.print(
-        f"check       cameras.{camera_mount.value}.masked_px, .max_off_axis_deg and .readout_ms (rolling shutter) are "
-        "still those of the rig below it",
+        f"check       cameras.{camera_mount.value}.T_{camera_mount.value}_camera (axes: x right, y down, z along the "
+        "view), .masked_px, .max_off_axis_deg and .readout_ms (rolling shutter) are still those of the rig below it",
         soft_wrap=True,
     )
 

@@ -42,6 +42,12 @@ def _rig(rig: Any) -> Iterator[str]:
     for name, camera in cameras.items() if isinstance(cameras, dict) else ():
         if isinstance(camera, dict) and camera.get("lens") == known.get(name, {}).get("lens"):
             yield f"rig.cameras.{name}.lens is that of the example rig ({EXAMPLE_RIG}): import yours with `grd lens`"
+        for key, value in known.get(name, {}).items() if isinstance(camera, dict) else ():
+            if key.startswith("T_") and camera.get(key) == value:
+                yield (
+                    f"rig.cameras.{name}.{key} is that of the example rig ({EXAMPLE_RIG}): measure yours; a yaw error "
+                    "of it is one of the drone's yaw"
+                )
 
 
 def _source(source: Source, config: dict[str, Any]) -> Iterator[str]:

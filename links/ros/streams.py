@@ -118,7 +118,8 @@ def image_records(stream: str, message: BagMessage, use: TopicUse) -> Iterator[R
     if message.type.endswith("CompressedImage"):
         data = bytes(value.data)
         if not data.startswith(_JPEG):
-            pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
+            unturned = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+            pixels = cv2.imdecode(np.frombuffer(data, np.uint8), unturned) if data else None
             if pixels is None:
                 raise LinkError(
                     f"{message.topic}: an image of format {value.format!r} is not read: convert the topic to JPEG or "

@@ -31,10 +31,11 @@ class LensFileError(ValueError):
         self.line = line
 
 
-def lens_from_kalibr(text: str, camera: str = "cam0", max_off_axis_deg: float = 117.5) -> CalibratedLens:
+def lens_from_kalibr(text: str, camera: str = "cam0", max_off_axis_deg: float = 85.0) -> CalibratedLens:
     """A camera of a Kalibr camchain YAML: `camera_model: pinhole` with `distortion_model: equidistant`.
 
-    Kalibr has no field of view of its own: pass the largest valid angle off axis.
+    Kalibr states no field of view. It uses no point at 90 deg off axis or more (PinholeProjection), so that beyond the
+    outermost points, some 85 deg, its polynomial is extrapolated.
     """
     try:
         tree: Any = yaml.safe_load(text)
@@ -60,7 +61,7 @@ def lens_from_kalibr(text: str, camera: str = "cam0", max_off_axis_deg: float = 
         wrong = "camera_model" if models[0] != "pinhole" else "distortion_model"
         raise LensFileError(
             f"{camera}: camera_model {models[0]!r} with distortion_model {models[1]!r} is not read here; "
-            "calibrate with `--models pinhole-equi`, or use OCamCalib",
+            "calibrate with OCamCalib, or, up to 85 deg off axis, with `--models pinhole-equi`",
             line(wrong),
         )
     for key in ("intrinsics", "distortion_coeffs"):

@@ -36,6 +36,20 @@ def test_a_frame_is_decoded_in_grey_at_the_records_time(progressive):
     assert camera.rejected == 0
 
 
+@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
+def test_an_image_is_not_turned_by_its_exif_orientation(orientation: int):
+    """The lens, the masks and the size are those of the image as it was sent."""
+    ramp, data = jpeg()
+    tag = b"II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0" + bytes([orientation, 0, 0, 0]) + bytes(4)
+    exif = b"Exif\0\0" + tag
+    turned = data[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + data[2:]
+    shown = cv2.imdecode(np.frombuffer(turned, np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert (np.abs(shown[0].astype(int) - shown[0, 0]).max() < 9) == (orientation in (6, 8))  # OpenCV would turn it
+    image = Camera(topic="/camera/vehicle").decode(record(turned))
+    assert image is not None
+    assert np.abs(image.grey.astype(int) - ramp).max() < 6
+
+
 def test_an_image_contains_its_readout_time():
     image = Camera(topic="/camera/vehicle", readout_ms=23.5).decode(record(jpeg(48, 64)[1]))
     assert image is not None

@@ -29,7 +29,8 @@ CODING_NS = 15_000_000  # to decode an image from the buffer
 class Webcam:
     """The plugged-in camera: its formats, its only size, the padding of its buffers, and its clock."""
 
-    def __init__(self, formats=("MJPG", "YUYV"), size_px=(64, 48), padding=b"", real_time=False):
+    def __init__(self, formats=("MJPG", "YUYV"), size_px=(64, 48), padding=b"", real_time=False, takes_rate=True):
+        self.takes_rate = takes_rate
         self.formats, self.size_px, self.padding, self.plugged = formats, size_px, padding, True
         self.opened, self.number, self.damaged, self._now_ns = [], 0, set(), None if real_time else 0
 
@@ -55,8 +56,9 @@ class Video:
 
     def __init__(self, webcam, source, api, asked):
         assert (source, api) == (DEVICE, cv2.CAP_V4L2)
-        self._webcam, self._open = webcam, webcam.plugged
         self.asked = dict(zip(asked[::2], asked[1::2], strict=True))
+        self._webcam = webcam
+        self._open = webcam.plugged and (webcam.takes_rate or cv2.CAP_PROP_FPS not in self.asked)
         webcam.opened.append(self)
         wanted = int(self.asked[cv2.CAP_PROP_FOURCC]).to_bytes(4, "little").decode()
         self._format = wanted if wanted in webcam.formats else webcam.formats[-1]
@@ -120,6 +122,14 @@ def test_mjpg_is_passed_through_without_padding(monkeypatch, padding):
     }
     capture.close()
     assert not video.isOpened()
+
+
+@pytest.mark.parametrize("formats", [("MJPG",), ("YUYV",)])
+def test_a_camera_whose_driver_refuses_a_rate_is_opened_without(monkeypatch, formats):
+    webcam = plug_in(monkeypatch, formats=formats, takes_rate=False)
+    assert capture_of(webcam).read().arrival_ns == PERIOD_NS
+    assert cv2.CAP_PROP_FPS not in webcam.opened[-1].asked
+    assert webcam.opened[-1].asked[cv2.CAP_PROP_FRAME_WIDTH] == 64
 
 
 def test_a_camera_without_mjpg_is_reopened_with_decoding_and_its_images_are_encoded(monkeypatch):

@@ -79,6 +79,7 @@ def test_check_warns_of_every_value_of_the_field_configuration_that_must_be_set(
     for words in (
         "rig.lidar is that of the example rig",
         "rig.cameras.vehicle.lens is that of the example rig",
+        "rig.cameras.drone.T_drone_camera is that of the example rig",
         "lidar.bind is 127.0.0.1",
         "servo.port is /dev/ttyUSB0",
         "autopilot.connection is udpin:127.0.0.1:14550",

@@ -228,7 +228,9 @@ class MessageIntervals:
         elif stream.answer:
             advice = f"the autopilot {stream.answer}: set its stream rates (ArduPilot SRn_RAW_SENS, PX4 MAV_n_MODE)"
         else:
-            advice = "the autopilot accepted more: is the link fast enough (PX4: MAV_n_RATE)? Does another station set it?"
+            advice = (
+                "the autopilot accepted more: is the link fast enough (PX4: MAV_n_RATE)? Does another station set it?"
+            )
         return f"{stream.name} arrives at {rate_hz:.1f} Hz, at least {NEEDED_IMU_HZ:g} Hz are needed; {advice}"
 
     @property

@@ -168,11 +168,11 @@ class Drive:
         counted_ticks = position_ticks % mx28.STEPS_PER_TURN
         low, high = self._settings.limit_ticks
         if not low - ARRIVED_TICKS <= counted_ticks <= high + ARRIVED_TICKS:
-            degrees = [mx28.TICK_RAD * math.degrees(ticks) for ticks in (counted_ticks, low, high)]
+            at_deg, low_deg, high_deg = (math.degrees(ticks * mx28.TICK_RAD) for ticks in (counted_ticks, low, high))
             raise SetupError(
-                "the servo is at {:.1f} deg, outside limits_deg {:.0f} to {:.0f}, and would turn the wrong way. Switch "
-                "it off, turn the table into the limits by hand and check its cable; mount the horn so that the limits "
-                "do not contain 0 deg (for example limits_deg: [90, 270])".format(*degrees)
+                f"the servo is at {at_deg:.1f} deg, outside limits_deg {low_deg:.0f} to {high_deg:.0f}, and may turn "
+                "the wrong way. Switch it off, turn the table into the limits by hand and check its cable; mount the "
+                "horn so that the limits do not contain 0 deg (for example limits_deg: [90, 270])"
             )
 
     def _enable_replies(self) -> None:

@@ -285,7 +285,7 @@ def _estimate(name: str, link: Autopilot, estimators: Sequence[AutopilotEstimato
         return warning(name, "its EKF has no yaw: normal without compass before poses are sent; keep it still and wait")
     if not newest.attitude_good:
         return fail(name, "its EKF has no attitude yet: keep it still and wait, then read its own messages")
-    held = newest.constant_position and link.settings.profile == "ardupilot"  # PX4 1.16: also at rest on the ground
+    held = newest.constant_position and link.settings.profile == "ardupilot"  # newer PX4: also at rest on the ground
     if held or not newest.position_good:
         return warning(name, "attitude good, no position: normal before poses are sent; check again when grd run sends")
     near = [f"{what} ({ratio:.1f})" for what, ratio in ratios.items() if ratio > WARN_RATIO]

@@ -46,6 +46,7 @@ def test_a_kalibr_file_gives_its_equidistant_camera():
     assert lens_from_kalibr(KALIBR, "cam0", max_off_axis_deg=120.0) == (KANNALA_BRANDT, (720, 720))
     unsized = KALIBR.replace("  resolution: [720, 720]\n", "")
     assert lens_from_kalibr(unsized, max_off_axis_deg=120.0) == (KANNALA_BRANDT, None)
+    assert lens_from_kalibr(KALIBR).lens.max_off_axis_deg < 90.0  # Kalibr uses no point beyond
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any, ClassVar
 
 import cv2
@@ -24,6 +24,7 @@ from flow.link import LinkError, Record, Source, SourceSettings
 from links.camera.capture import CaptureSettings, Frame
 from links.camera.live_camera import LiveCamera
 from links.recording import CompressedImage, decode_compressed_image, encode_compressed_image
+from stages.geometry.rig import SizePx, width_height_px
 from stages.messages import Image
 
 AS_SENT = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION  # the lens is that of the unturned image
@@ -38,7 +39,7 @@ class CameraSettings(SourceSettings):
     topic: str
     source: str | None = None  # live: /dev/video0 (better /dev/v4l/by-id/...), rtsp://..., http://..., a video file
     frame_id: str | None = None  # None: from the topic, /camera/vehicle becomes camera_vehicle
-    size_px: int | tuple[int, int] | None = None  # the lens is calibrated for this size: `$rig.cameras.vehicle.size_px`
+    size_px: SizePx | None = None  # the lens is calibrated for this size; null: not checked
     fps: float = Field(30.0, ge=1, le=240)  # requested from a device
     latency_s: float = Field(0.0, ge=0, le=1)  # from the exposure of the middle row to reception
     readout_ms: float = Field(0.0, ge=0, le=100)  # from the first row's exposure to the last's: a rolling shutter
@@ -53,6 +54,8 @@ class Camera(Source[CameraSettings]):
 
     def __init__(self, settings: CameraSettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
+        size_px = self.settings.size_px
+        self._size_px = None if size_px is None else width_height_px(size_px)
         self._rejected: int = 0
         self._counts: Counter[str] = Counter()
         self._slow: tuple[int, float] = (0, 0.0)  # newest count of "too slow", and when it increased
@@ -90,38 +93,40 @@ class Camera(Source[CameraSettings]):
         settings = self.settings
         if settings.source is None:
             raise LinkError(f"{settings.topic}: set `source` to run live: /dev/video0, a URL, or a video file")
-        size_px = (settings.size_px, settings.size_px) if isinstance(settings.size_px, int) else settings.size_px
-        capture = CaptureSettings(settings.source, size_px, settings.fps, settings.timeout_s, settings.jpeg_quality)
+        capture = CaptureSettings(
+            settings.source, self._size_px, settings.fps, settings.timeout_s, settings.jpeg_quality
+        )
         with LiveCamera(capture, self._counts).open() as frames:
-            yield self._records(frames, size_px)
+            yield self._records(frames)
 
-    def _records(self, frames: Iterator[Frame], size_px: tuple[int, int] | None) -> Iterator[Record]:
+    def _records(self, frames: Iterator[Frame]) -> Iterator[Record]:
         settings = self.settings
         frame_id = settings.frame_id or settings.topic.strip("/").replace("/", "_")
         for sequence, frame in enumerate(frames):
-            self._check_size(frame.jpeg, size_px)
+            with suppress(ValueError):  # no JPEG: `decode` counts it
+                self._check_size(frame.jpeg)
             stamp_ns = frame.received_ns - round(1e9 * settings.latency_s)
             data = encode_compressed_image(CompressedImage(stamp_ns, frame_id, frame.jpeg))
             yield Record(settings.topic, frame.arrival_ns, stamp_ns, data, sequence)
 
-    def _check_size(self, jpeg: bytes, wanted_px: tuple[int, int] | None) -> None:
-        try:
-            found_px = jpeg_size(jpeg)
-        except ValueError:
-            return  # `decode` counts it
-        if wanted_px is not None and found_px != wanted_px:
+    def _check_size(self, jpeg: bytes) -> None:
+        found_px = jpeg_size(jpeg)
+        if self._size_px is not None and found_px != self._size_px:
             raise LinkError(
                 f"{self.topic}: frames of {found_px[0]} x {found_px[1]} pixels, but the lens is calibrated for "
-                f"{wanted_px[0]} x {wanted_px[1]}: set the camera's mode, or calibrate the lens in this one"
+                f"{self._size_px[0]} x {self._size_px[1]}: set the camera's mode, or calibrate the lens in this one"
             )
 
     def decode(self, record: Record) -> Image | None:
-        """The image of one record, with the record's stamp; None: invalid."""
+        """The image of one record, with the record's stamp; None: invalid. LinkError: it has another size."""
         try:
-            return decode_image(record.stamp_ns, decode_compressed_image(record.data), 1e-3 * self.settings.readout_ms)
+            frame = decode_compressed_image(record.data)
+            image = decode_image(record.stamp_ns, frame, 1e-3 * self.settings.readout_ms)
         except (ValueError, LinkError):
             self._rejected += 1
             return None
+        self._check_size(frame.data)
+        return image
 
 
 def decode_image(stamp_ns: int, frame: CompressedImage, readout_s: float = 0.0) -> Image:

@@ -14,6 +14,7 @@ from links.preflight.check_result import CheckResult, fail, ok, warning
 from links.preflight.link_checks import LinkChecks, declares
 from links.preflight.observations import Observation, Observations, ObservedSource
 from links.recording import decode_compressed_image
+from stages.geometry.rig import width_height_px
 
 MIN_HZ = 1.0
 SILENT_S = 1.0  # a camera without frames for longer has failed
@@ -68,9 +69,7 @@ class CameraChecks(LinkChecks):
 def rig_size_px(rig: Mapping[str, Any], link: Camera) -> tuple[int, int] | None:
     """Width and height that a camera's lens was calibrated for: its own setting, or the rig's; None: neither is set."""
     size: Any = link.settings.size_px or _rig_camera(rig, link).get("size_px")
-    if size is None:
-        return None
-    return (size, size) if isinstance(size, int) else (int(size[0]), int(size[1]))
+    return None if size is None else width_height_px(size if isinstance(size, int) else (int(size[0]), int(size[1])))
 
 
 def rig_readout_ms(rig: Mapping[str, Any], link: Camera) -> float | None:

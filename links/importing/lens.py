@@ -58,17 +58,11 @@ def import_lens(
     found = read_lens(file, camera, max_off_axis_deg)
     target.write_text(lens_text(found, camera_mount, file.name), encoding="utf-8")
     lens, size_px = found
-    width, height = size_px or (None, None)
-    size = f"{width} x {height} px" if size_px else "the file does not state the image size"
+    size = f"{size_px[0]} x {size_px[1]} px" if size_px else "the file does not state the image size"
     out.print(f"lens        {lens.model}, up to {lens.max_off_axis_deg:g} deg off axis, {size}", markup=False)
     out.print(
         f"rig         {target}   (to fly: include it after the rig; or grd replay --overlay {target})", markup=False
     )
-    if width != height:
-        out.print(
-            f"size_px is not set: set size_px: [{width}, {height}] in the config of camera_{camera_mount.value}",
-            markup=False,
-        )
     out.print(
         f"check       cameras.{camera_mount.value}.T_{camera_mount.value}_camera (axes: x right, y down, z along the "
         "view), .masked_px, .max_off_axis_deg and .readout_ms (rolling shutter) are still those of the rig below it",
@@ -97,9 +91,12 @@ def read_lens(file: Path, camera: str, max_off_axis_deg: float | None) -> Calibr
 
 
 def lens_text(found: CalibratedLens, camera_mount: CameraMount, source: str) -> str:
-    """The rig file. A size that is not known, or not square, is null: it hides that of the rig below."""
+    """The rig file. A size that is not known is null: it hides that of the rig below."""
     width, height = found.size_px or (None, None)
-    camera = {"size_px": width if width == height else None, "lens": found.lens.model_dump(mode="json")}
+    camera = {
+        "size_px": width if width == height else [width, height],
+        "lens": found.lens.model_dump(mode="json"),
+    }
     head = [
         f"# The lens of the {camera_mount.value}'s camera, by `grd lens {source} {camera_mount.value}`.",
         "# To fly: include it after the rig; to replay with it: grd replay RECORDING --overlay THIS_FILE.",

@@ -20,6 +20,7 @@ from links.viewer.entities import Entities, Entity, log_entry, plot, stage_of, s
 from links.viewer.lenses import arcs, pixels_of, strips
 from links.viewer.scene import LoggedImage, ViewerScene, sphere_frame
 from stages.geometry.frames import Array64
+from stages.geometry.rig import width_height_px
 from stages.messages import FollowedFeatures, Image, VanishingDirections
 
 IMAGE_PX = 480  # longer side of a logged image
@@ -148,9 +149,9 @@ def _on_image(
         raise LookupError(
             f"no lens for the image of {frame_id}, so no lines on it: set `cameras: $rig.cameras` of the viewer"
         )
-    if camera.size_px is not None and camera.size_px != logged.width_px:
+    if camera.size_px is not None and (width_px := width_height_px(camera.size_px)[0]) != logged.width_px:
         raise ValueError(
-            f"the image of {frame_id} is {logged.width_px} px wide, its lens in `cameras` is for {camera.size_px}: "
+            f"the image of {frame_id} is {logged.width_px} px wide, its lens in `cameras` is for {width_px}: "
             "is this the rig of this recording?"
         )
     drawn, lengths, owner = strips(logged.scaled(pixels_of(camera, points)), arc)

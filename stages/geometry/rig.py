@@ -7,7 +7,7 @@ Source: ours; the format of configs/rigs/standard.yaml.
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -16,6 +16,15 @@ from stages.geometry.frames import Pose
 from stages.geometry.lens import Lens, Polygon
 from stages.geometry.rig_lidar import RigLidar
 from stages.messages import CameraMount
+
+_Pixels = Annotated[int, Field(ge=1)]
+SizePx = _Pixels | tuple[_Pixels, _Pixels]
+"""Size of a camera's images: the side of square ones, or (width, height)."""
+
+
+def width_height_px(size: SizePx) -> tuple[int, int]:
+    """(width, height) of images."""
+    return (size, size) if isinstance(size, int) else size
 
 
 class RigDrone(StrictModel):
@@ -28,7 +37,7 @@ class _Camera(StrictModel):
     """What both cameras have; each also has `pose()`, T_mount_camera."""
 
     lens: Lens
-    size_px: int | None = Field(None, ge=1)  # side of the square calibration images; None: not known, or not square
+    size_px: SizePx | None = None  # of the calibration images; None: not known, and the images are not checked
     max_off_axis_deg: float | None = Field(None, gt=0, le=150)  # rays farther off axis are not used; None: lens's limit
     masked_px: tuple[Polygon, ...] = ()  # over the body of the vehicle or drone
     readout_ms: float = Field(0.0, ge=0, le=100)  # from the first row's exposure to the last's: a rolling shutter

@@ -120,6 +120,7 @@ def test_a_vehicle_that_moved_by_its_odometry_is_rejected(tmp_path):
     assert list(tmp_path.iterdir()) == [drove]
 
 
+@pytest.mark.slow
 def test_a_small_odometry_drift_while_parked_is_decided_by_the_surfaces(tmp_path):
     drifts = tmp_path / "drifts.mcap"
     with RecordingReader(STREET) as reader, RecordingWriter(drifts, rig_yaml=reader.rig_yaml or "") as writer:

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from flow.link import Record
+from flow.link import LinkError, Record
 from flow.message import check_arrays
 from links.camera import Camera
 from links.camera.camera import decode_image, jpeg_size
@@ -55,6 +55,16 @@ def test_an_image_contains_its_readout_time():
     assert image is not None
     assert image.readout_s == pytest.approx(0.0235)
     assert image.rows_after_s() == pytest.approx(0.0235 / 47)
+
+
+@pytest.mark.parametrize("size_px", [64, (48, 64), 720])
+def test_an_image_of_another_size_than_the_lenss_is_refused(size_px):
+    """The lens would give each of its pixels another direction."""
+    camera, other = Camera(topic="/camera/vehicle", size_px=size_px), record(jpeg(48, 64)[1])
+    with pytest.raises(LinkError, match="frames of 64 x 48 pixels, but the lens is calibrated for"):
+        camera.decode(other)
+    assert Camera(topic="/camera/vehicle", size_px=(64, 48)).decode(other) is not None
+    assert Camera(topic="/camera/vehicle", size_px=48).decode(record(jpeg(48, 48)[1])) is not None
 
 
 def test_the_size_is_read_without_decoding():

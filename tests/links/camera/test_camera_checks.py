@@ -75,7 +75,7 @@ def test_the_field_configuration_has_no_camera_latency_set():
     nodes = load_graph(CONFIGS / "field.yaml").nodes
     for name in ("camera_vehicle", "camera_drone"):
         assert nodes[name].config["latency_s"] == 0
-        assert levels(camera_checks(observe(nodes[name].build(), images()), (64, 64), 0.0))["latency"] == "warning"
+        assert levels(camera_checks(observe(nodes[name].build(), images(size=720)), None, 0.0))["latency"] == "warning"
 
 
 def test_a_camera_without_images_fails():

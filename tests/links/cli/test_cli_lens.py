@@ -41,15 +41,13 @@ def test_both_lenses_are_in_the_rig_of_a_configuration_with_their_numbers(grd, t
     assert cameras["drone"]["T_drone_camera"]["rpy_deg"] == [180.0, 0.0, -90.0]
 
 
-def test_a_size_that_is_not_square_is_left_to_the_camera_s_link(grd, tmp_path):
+def test_a_size_that_is_not_square_is_that_of_the_camera(grd, tmp_path):
     (tmp_path / "wide.yaml").write_text(KALIBR.replace("[720, 720]", "[1280, 800]"))
-    assert "size_px: [1280, 800] in the config of camera_vehicle" in grd("lens", "wide.yaml", "vehicle")
+    assert "1280 x 800 px" in grd("lens", "wide.yaml", "vehicle")
     config = tmp_path / "mine.yaml"
-    config.write_text(
-        f"include: [{ROOT}/configs/field.yaml, wide.vehicle.rig.yaml]\n"
-        "links: {camera_vehicle: {config: {size_px: [1280, 800]}}}\n"
-    )
+    config.write_text(f"include: [{ROOT}/configs/field.yaml, wide.vehicle.rig.yaml]\n")
     assert "no errors" in grd("check", config)
+    assert load_graph(config).nodes["camera_vehicle"].build().settings.size_px == (1280, 800)
 
 
 def test_a_wrong_file_is_named_with_its_line_and_nothing_is_written(grd, tmp_path):

@@ -522,6 +522,7 @@ def flown(config: Path, name: str, stack_settings: dict[str, Any], gap_s: tuple[
     return simulation.flight.stack
 
 
+@pytest.mark.slow
 def test_a_flight_is_switched_to_grd_and_back_to_gps_when_the_lidar_ends(tmp_path: Path):
     config = tmp_path / "switch.yaml"
     include = ROOT / "configs/sim_flight_fixes.yaml"
@@ -554,6 +555,7 @@ def test_after_a_yaw_reset_of_the_ekf_a_set_is_requested_only_while_the_velocity
     assert flight.fly(1).requested == [2, 1]
 
 
+@pytest.mark.slow
 def test_a_flight_whose_gps_has_ended_stays_on_grds_set_in_a_gap_of_the_lidar():
     config = ROOT / "configs/sim_flight_switch_fixes.yaml"
     plan = [{"do": "path", "for_s": 20}, {"do": "square", "for_s": 30, "side_m": 8.0}]

@@ -430,8 +430,11 @@ def test_a_sweep_over_houses_reports_the_number_of_rejected_objects():
 # telemetry of the drone
 
 
-@pytest.mark.parametrize("settings", [{}, {"free_space": False}], ids=["all features", "without free space"])
-@pytest.mark.parametrize("driving", [False, True])
+@pytest.mark.parametrize(
+    ("driving", "settings"),
+    [(False, {}), (True, {"free_space": False})],
+    ids=["parked, all features", "driving, without free space"],
+)
 def test_first_observations_are_rejected_together_as_one_by_one_with_candidates(driving, settings, monkeypatch):
     drives_mps = (2.0, 0.0, 0.0) if driving else (0.0, 0.0, 0.0)
     poles = [Wire((k - 6, 9, 0), (k - 6, 9, 6 + k % 3), 0.1) for k in range(12)]

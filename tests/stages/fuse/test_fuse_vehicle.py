@@ -157,33 +157,31 @@ class Following(ImuFlight):
 
 
 @pytest.mark.parametrize(("mps", "late_s"), [(0.0, 0.0), (5.0, 0.0), (5.0, 0.2)])
-def test_after_an_outage_in_the_same_frame_the_heading_is_known_again_soon(mps, late_s):
+@pytest.mark.parametrize("seed", [1, 2, *(pytest.param(k, marks=pytest.mark.slow) for k in range(3, 7))])
+def test_after_an_outage_in_the_same_frame_the_heading_is_known_again_soon(seed, mps, late_s):
     """LiDAR positions that arrive during the outage are not compared, however late they are."""
-    again_s = []
     gap, delay = without(("motion",), *OUTAGE_S), late(("fix",), late_s)
-    for seed in range(1, 7):
-        flown = fly(by_imu(seed, mps), fault=lambda events: delay(gap(events)), frame=VEHICLE)
-        again_s.append(full_again_s(flown))
-        assert flown.wrong == 0
-        assert np.abs(yaws_after(flown, OUTAGE_S[1])).max() < 8.0
-    assert max(again_s) < 3.2
+    flown = fly(by_imu(seed, mps), fault=lambda events: delay(gap(events)), frame=VEHICLE)
+    assert flown.wrong == 0
+    assert np.abs(yaws_after(flown, OUTAGE_S[1])).max() < 8.0
+    assert full_again_s(flown) < 3.2
 
 
 @pytest.mark.parametrize(
     ("mps", "deg", "beside_m"),
     [(0.0, 8.0, 0.5), (0.0, 115.0, 5.0), (5.0, 60.0, 0.5), (5.0, 30.0, 5.0), (5.0, 60.0, 5.0)],
 )
-def test_after_an_outage_another_frame_is_not_taken_for_the_same(mps, deg, beside_m):
+@pytest.mark.parametrize("seed", [1, *(pytest.param(k, marks=pytest.mark.slow) for k in (2, 3))])
+def test_after_an_outage_another_frame_is_not_taken_for_the_same(seed, mps, deg, beside_m):
     """It is turned about the vehicle, as when an odometry restarts there with another yaw."""
     gap, jump = without(("motion",), *OUTAGE_S), jumped(OUTAGE_S[1], deg, xyz_m=(0.0, 0.0, 0.0))
-    for seed in range(1, 4):
-        flown = fly(
-            Following(seed=seed, until_s=27.0, vehicle_mps=mps, beside_m=beside_m),
-            fault=lambda events: jump(gap(events)),
-            frame=VEHICLE,
-        )
-        assert flown.wrong == 0
-        assert math.isinf(full_again_s(flown))
+    flown = fly(
+        Following(seed=seed, until_s=27.0, vehicle_mps=mps, beside_m=beside_m),
+        fault=lambda events: jump(gap(events)),
+        frame=VEHICLE,
+    )
+    assert flown.wrong == 0
+    assert math.isinf(full_again_s(flown))
 
 
 def test_a_second_outage_soon_after_the_first_has_the_same_prior():

@@ -42,9 +42,10 @@ def test_a_street_is_reported_by_parameter_with_reasons_for_rejection(calibrated
     assert "--overlay" in text
 
 
-def test_a_stated_orientation_determines_the_zero(calibrated, tmp_path):
+def test_a_stated_orientation_determines_the_zero_and_figures_need_matplotlib(calibrated, tmp_path, monkeypatch):
     _, without = calibrated
     assert "--parallel" in without
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     text = grd("calibrate", STREET, "-o", tmp_path / "rig.yaml", "--parallel", "0.15", "--level", "0.2")
     assert "servo's zero stays as it is" not in text
     assert "the zero found in it" in text
@@ -54,6 +55,8 @@ def test_a_stated_orientation_determines_the_zero(calibrated, tmp_path):
     mount = yaml.safe_load(written)["rig"]["lidar"]["mount"]
     assert 0.15 <= mount["pointing_sigma_deg"] < 0.2
     assert abs(mount["servo_zero_deg"]) < 0.1  # this simulated zero is right
+    assert "figures none: matplotlib is not installed: pip install -e '.[evaluate]'" in text
+    assert not (tmp_path / "rig.svg").exists()
 
 
 def test_the_new_rig_can_be_laid_over_a_configuration(calibrated):
@@ -76,14 +79,6 @@ def test_the_figures_are_one_svg_with_four_charts(calibrated):
     assert len(charts) == 4
     assert any("thick before" in text for text in texts)
     assert {"one wall from above", "distance of returns from their patch"} <= set(texts)
-
-
-def test_without_matplotlib_the_rig_is_written_and_the_missing_extra_is_named(tmp_path, monkeypatch):
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    text = grd("calibrate", STREET, "-o", tmp_path / "rig.yaml")
-    assert "figures none: matplotlib is not installed: pip install -e '.[evaluate]'" in text
-    assert (tmp_path / "rig.yaml").exists()
-    assert not (tmp_path / "rig.svg").exists()
 
 
 def test_an_existing_rig_is_overwritten_on_request_only(calibrated):

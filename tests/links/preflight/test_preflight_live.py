@@ -187,20 +187,13 @@ def test_a_silent_rig_fails_for_each_device(bench, emulator):
     assert not {"autopilot parameters", "axes: accelerometer"} & set(found)
 
 
-def test_a_full_disk_fails_although_all_else_passes(bench, emulator, monkeypatch):
+def test_a_full_disk_a_wrong_parameter_and_an_inverted_axis_fail(bench, emulator, monkeypatch):
     graph = bench.write(emulator.path)
     monkeypatch.setattr("shutil.disk_usage", lambda folder: SimpleNamespace(free=1e6))
-    with SendingLidar(bench.ports["lidar"]), bench.drone():
-        found = results_of(graph)
-    assert {n for n, v in found.items() if v.level is Level.FAIL} == {"disk"}
-
-
-def test_a_wrong_parameter_and_an_inverted_axis_fail(bench, emulator):
-    graph = bench.write(emulator.path)
     parameters = good_parameters() | {"EK3_SRC2_YAW": 6.0}
     with SendingLidar(bench.ports["lidar"]), bench.drone(flight=OnTheGround(upside_down=True), parameters=parameters):
         found = results_of(graph)
-    assert {n for n, v in found.items() if v.level is Level.FAIL} == {"autopilot parameters", "axes: accelerometer"}
+    assert {n for n, v in found.items() if v.level is Level.FAIL} == {"disk", "autopilot parameters", "axes: accelerometer"}
     assert "EK3_SRC2_YAW is 6, but must be 1 or 2 or 3" in found["autopilot parameters"].sentence
     assert "z is measured as -z" in found["axes: accelerometer"].sentence
 

@@ -529,7 +529,7 @@ def in_chains(*trajectories: Trajectory) -> Publisher:
     return publish
 
 
-@pytest.mark.parametrize("count", [2, 4, 8])
+@pytest.mark.parametrize("count", [2, pytest.param(4, marks=pytest.mark.slow), 8])
 def test_the_drone_of_each_chain_is_observed_again_before_its_track_is_lost(count):
     trajectories = [towards(10.0 + 340.0 * k / count, 45.0) for k in range(count)]
     flight = fly(BeamAim(mount=ON_ITS_SIDE), 12.0, in_chains(*trajectories), start_rad=0.5)

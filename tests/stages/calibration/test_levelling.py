@@ -95,9 +95,9 @@ def test_an_angle_to_the_wall_is_in_the_zero_and_within_its_sigma():
 )
 def test_unsuitable_walls_are_rejected(planes, why):
     _, found = found_in((*GROUND, *planes, *ENDS), parallel_rad=STATED_RAD)
-    before = found_in((*GROUND, *planes, *ENDS))[1]
-    assert why in finding(found, "zero").rejected
-    assert found.mount == before.mount
+    result = finding(found, "zero")
+    assert why in result.rejected
+    assert found.mount.servo_zero_deg == result.before
 
 
 def test_an_orientation_less_accurate_than_an_uncalibrated_rig_is_rejected():

@@ -14,7 +14,9 @@ def stale(flight: SlowFlight) -> int:
     return sum(age_s > LATE_S for age_s in flight.ages_s)
 
 
-@pytest.mark.parametrize("kbit_per_s", [40.0, 57.6, 80.0, 96.0])  # 50 poses/s need 98
+@pytest.mark.parametrize(
+    "kbit_per_s", [40.0, *(pytest.param(rate, marks=pytest.mark.slow) for rate in (57.6, 80.0)), 96.0]
+)  # 50 poses/s need 98
 def test_a_bridge_too_slow_for_the_poses_forwards_few_late_ones_and_ever_fewer(
     kbit_per_s: float, monkeypatch: pytest.MonkeyPatch
 ):
@@ -79,7 +81,9 @@ def test_a_restarted_autopilot_without_timesync_replies_gets_poses_with_its_firs
     assert (flight.late_since_s, flight.session.status) == ([], None)
 
 
-@pytest.mark.parametrize("kbit_per_s", [10.0, 14.0, 16.0, 18.0, 20.0, 24.0, 40.0])
+@pytest.mark.parametrize(
+    "kbit_per_s", [10.0, 16.0, *(pytest.param(rate, marks=pytest.mark.slow) for rate in (14.0, 18.0, 24.0)), 20.0, 40.0]
+)
 def test_on_a_slow_tcp_or_serial_line_heartbeats_and_timesync_are_sent_and_late_poses_are_not(
     kbit_per_s: float, monkeypatch: pytest.MonkeyPatch
 ):

@@ -153,6 +153,7 @@ def test_a_failed_flight_leaves_no_run_folder(tmp_path, config: Path, monkeypatc
     assert list((tmp_path / "runs").iterdir()) == []
 
 
+@pytest.mark.slow
 def test_the_rig_has_cameras_where_the_conditions_have(tmp_path, monkeypatch) -> None:
     """Without them `vision.yaml` is `estimate.yaml`."""
     monkeypatch.setattr(flights, "USUAL_DURATION_S", 0.2)
@@ -178,6 +179,7 @@ def test_a_run_of_an_older_recording_is_not_kept(tmp_path, short, config: Path) 
     assert (report.kept, report.replayed) == (1, 1)
 
 
+@pytest.mark.slow
 def test_a_changed_configuration_is_detected_but_not_a_comment_or_a_viewer(tmp_path, short, config: Path) -> None:
     def made() -> int:
         return make_matrix(tmp_path / "m", [HOVER], range(1, 2), config, silent).made

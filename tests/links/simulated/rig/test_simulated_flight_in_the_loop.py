@@ -173,7 +173,10 @@ def test_after_a_kill_grd_starts_again_and_the_flight_goes_on() -> None:
 
 @pytest.mark.parametrize(
     ("config", "flight", "killed_s"),
-    [("sim_flight_yaw_fixes", "matrix/brisk", (22.0, 23.0)), ("sim_flight_fixes", "hover_fixes", (14.0, 15.0))],
+    [
+        ("sim_flight_yaw_fixes", "matrix/brisk", (22.0, 23.0)),
+        pytest.param("sim_flight_fixes", "hover_fixes", (14.0, 15.0), marks=pytest.mark.slow),
+    ],
 )
 def test_after_a_kill_with_a_state_file_poses_are_sent_again_within_5_s(
     config: str, flight: str, killed_s: tuple[float, float], tmp_path: Path

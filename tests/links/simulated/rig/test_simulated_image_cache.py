@@ -88,6 +88,7 @@ def test_another_servo_lidar_or_radio_keeps_all_images(scenario, recorded, tmp_p
     assert packets[0] != packets[1]
 
 
+@pytest.mark.slow
 def test_a_shorter_flight_uses_the_images_that_it_would_have_rendered(scenario, recorded) -> None:
     shorter = scenario.changed(duration_s=0.3)
     assert list(Simulation(shorter, images=ImageCache(recorded, shorter)).records()) == list(
@@ -121,6 +122,7 @@ def test_images_of_the_first_lap_repeat_with_a_delay(closed_path, tmp_path) -> N
         assert all(r.arrival_ns >= r.stamp_ns for r in seen)
 
 
+@pytest.mark.slow
 def test_a_flight_no_longer_than_the_recorded_one_uses_its_own_images_after_the_first_lap(
     closed_path, tmp_path
 ) -> None:
@@ -138,6 +140,7 @@ def test_a_flight_no_longer_than_the_recorded_one_uses_its_own_images_after_the_
         ({"cameras": {"vehicle": {"size_px": 64, "rate_hz": 4.5}}}, "4.5 Hz are 4.50 images in a lap of 1 s"),
     ],
 )
+@pytest.mark.slow
 def test_images_do_not_repeat_where_they_would_differ(closed_path, tmp_path, change, text) -> None:
     longer = closed_path.changed(**change)
     simulate_into(tmp_path / "first.mcap", longer.changed(duration_s=1.4))

@@ -63,7 +63,7 @@ def pose_jitter_rad2():
     return np.maximum(-np.mean(error[1:] * error[:-1], axis=0), 0.0)
 
 
-@pytest.mark.parametrize("key_parallax_deg", [0.01, 4.0])
+@pytest.mark.parametrize("key_parallax_deg", [pytest.param(0.01, marks=pytest.mark.slow), 4.0])
 def test_the_stated_covariance_of_a_real_drive_is_consistent(key_parallax_deg):
     errors = [row for row in odometry_errors(key_parallax_deg) if row[0] > FIRST_MEASURED]
     jitter = 2.0 * np.diag(pose_jitter_rad2())

@@ -11,6 +11,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Mapping
+from contextlib import suppress
 from types import TracebackType
 from typing import Any
 
@@ -128,7 +129,8 @@ class LiveView:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         if self._screen is not None:
-            self._screen.stop()
+            with suppress(OSError):  # the terminal is gone
+                self._screen.stop()
 
     def show(self, status: RunStatus) -> None:
         """Print new events at once; the status every SCREEN_PERIOD_S on a terminal, otherwise every LINE_PERIOD_S."""

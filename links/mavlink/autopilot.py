@@ -23,6 +23,7 @@ from flow.counters import Counters
 from flow.link import LinkError, Record, Source, SourceSettings
 from links.clock import host_time
 from links.clock.device_clock import DeviceClock
+from links.clock.host_boot import host_boot
 from links.mavlink.autopilot_session import AutopilotSession
 from links.mavlink.frame_decoder import FrameDecoder
 from links.mavlink.origin import GlobalOrigin, OriginSender, OriginState
@@ -197,7 +198,8 @@ class Autopilot(Source[AutopilotSettings]):
         settings = self.settings
         target = settings.system_id, settings.component_id
         if self._sent_state is None:
-            self._sent_state = SentState(settings.own_state_file, now_ns())
+            boot = host_boot(now_ns()) if threaded else None
+            self._sent_state = SentState(settings.own_state_file, now_ns(), boot)
         if self._poses is None:
             self._poses = PoseSender(
                 settings.send,

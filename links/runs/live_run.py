@@ -105,7 +105,10 @@ def _show(live: Live, live_since_s: float, show: ShowStatus, run: RunFolder, use
 
 @contextmanager
 def stop_signals() -> Generator[threading.Event]:
-    """An event that SIGINT and SIGTERM set; a second signal has its previous effect."""
+    """An event that SIGINT and SIGTERM set; a second signal has its previous effect.
+
+    SIGHUP is ignored: a terminal that hangs up, as an SSH connection that is lost, ends no flight.
+    """
     stopped = threading.Event()
 
     def stop(number: int, frame: FrameType | None) -> None:
@@ -114,6 +117,7 @@ def stop_signals() -> Generator[threading.Event]:
         signal.signal(number, before[number])
 
     before = {int(number): signal.signal(number, stop) for number in STOP_SIGNALS}
+    before[signal.SIGHUP] = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # workers inherit it
     try:
         yield stopped
     finally:

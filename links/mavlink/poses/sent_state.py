@@ -7,8 +7,8 @@ not independent. Without a file every start is taken as the first one since the 
 With the pose the autopilot's local frame in `map` is kept (`odom_frame.py`). The next session reports it as the first
 received frame, and a stage decides whether it still holds.
 
-Times are host times. If the wall clock of a host without a battery is set between two runs, they are wrong: see
-deploy/grd.service, which orders grd after time-sync.
+Times are host times, and the file has the time of the host's boot on the same clock: while the host has not rebooted,
+the next session knows the time of the pose however the wall clock was set in between (`links/clock/host_boot.py`).
 
 Source: ours.
 """
@@ -20,6 +20,7 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
+from links.clock.host_boot import HostBoot, on_own_clock
 from links.mavlink.transport.framing import dialect
 
 WRITE_PERIOD_NS = 100_000_000  # period of writing; after a source switch an older frame odom is another one
@@ -28,10 +29,11 @@ WRITE_PERIOD_NS = 100_000_000  # period of writing; after a source switch an old
 class SentState:
     """One per run. Reads the file when it is made; `write` is called regularly, by one thread, and may block."""
 
-    def __init__(self, file: Path | None, now_ns: int) -> None:
+    def __init__(self, file: Path | None, now_ns: int, boot: HostBoot | None = None) -> None:
+        """`boot` None: the clock of all runs is the same, as in virtual time."""
         self.status: str | None = None
         """Why the file cannot be read or written."""
-        self._file = file
+        self._file, self._boot = file, boot
         self._newest: tuple[int, bytes] | None = None
         self._odom: bytes | None = None
         self._written_ns: int | None = None
@@ -61,7 +63,12 @@ class SentState:
         partial = self._file.with_suffix(".partial")
         try:
             self._file.parent.mkdir(parents=True, exist_ok=True)
-            fields = {"sent_ns": newest[0], "frame": newest[1].hex(), "odom": self._odom and self._odom.hex()}
+            fields = {
+                "sent_ns": newest[0],
+                "boot": self._boot and [self._boot.id, self._boot.at_ns],
+                "frame": newest[1].hex(),
+                "odom": self._odom and self._odom.hex(),
+            }
             partial.write_text(json.dumps(fields), encoding="ascii")
             os.replace(partial, self._file)
         except OSError as error:
@@ -76,11 +83,13 @@ class SentState:
         try:
             fields = json.loads(self._file.read_text(encoding="ascii"))
             sent_ns, frame = int(fields["sent_ns"]), bytes.fromhex(fields["frame"])
-            odom = fields.get("odom")
-            return max(0, min(sent_ns, now_ns)), frame, None if odom is None else bytes.fromhex(odom)
+            odom, boot = fields.get("odom"), fields.get("boot")
+            boot = None if boot is None else HostBoot(str(boot[0]), int(boot[1]))
+            sent_ns = max(0, min(on_own_clock(sent_ns, boot, self._boot), now_ns))
+            return sent_ns, frame, None if odom is None else bytes.fromhex(odom)
         except FileNotFoundError:
             return None
-        except (OSError, ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
+        except (OSError, ValueError, TypeError, LookupError, OverflowError, RecursionError) as error:
             self.status = f"{self._file} cannot be read ({error!r}): delete it after a reboot of the autopilot"
             return now_ns, _unknown_pose(), None
 

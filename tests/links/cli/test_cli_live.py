@@ -213,6 +213,18 @@ def test_a_signal_ends_a_run_in_order(tmp_path, number):
         assert reader.topics["/clock"] == summary["records"]
 
 
+def test_a_terminal_that_hangs_up_ends_no_run(tmp_path):
+    """As an SSH connection that is lost in flight."""
+    child, last = start(tmp_path, CONFIG)
+    wait_for_records(child, last, 0.3)
+    child.send_signal(signal.SIGHUP)
+    wait_for_records(child, last, 0.6)
+    assert child.poll() is None
+    child.send_signal(signal.SIGTERM)
+    output, _ = child.communicate(timeout=PATIENCE_S)
+    assert child.returncode == 0, output
+
+
 def test_the_process_ends_within_two_seconds_of_ctrl_c(tmp_path):
     """Recording, summary and all. The promise is of time: on a machine that is too busy for it, the best of three."""
     took_s = []

@@ -193,7 +193,11 @@ def test_a_full_disk_a_wrong_parameter_and_an_inverted_axis_fail(bench, emulator
     parameters = good_parameters() | {"EK3_SRC2_YAW": 6.0}
     with SendingLidar(bench.ports["lidar"]), bench.drone(flight=OnTheGround(upside_down=True), parameters=parameters):
         found = results_of(graph)
-    assert {n for n, v in found.items() if v.level is Level.FAIL} == {"disk", "autopilot parameters", "axes: accelerometer"}
+    assert {n for n, v in found.items() if v.level is Level.FAIL} == {
+        "disk",
+        "autopilot parameters",
+        "axes: accelerometer",
+    }
     assert "EK3_SRC2_YAW is 6, but must be 1 or 2 or 3" in found["autopilot parameters"].sentence
     assert "z is measured as -z" in found["axes: accelerometer"].sentence
 

@@ -13,6 +13,7 @@ from pymavlink.dialects.v20 import ardupilotmega
 
 from flow.link import Record
 from links.clock import host_time
+from links.clock.host_boot import HostBoot, host_boot
 from links.mavlink import Autopilot
 from links.mavlink.poses.sent_state import SentState
 from links.mavlink.transport.framing import packed, parse_frame
@@ -36,6 +37,39 @@ def test_the_newest_pose_is_kept(tmp_path: Path):
         state.write()
     assert SentState(file, 10 * S).take_earlier() == (8 * S, b"\x03", None)
     assert SentState(file, 7 * S).take_earlier() == (7 * S, b"\x03", None)  # not from the future
+
+
+@pytest.mark.parametrize("step_s", [57_600, -57_600])
+def test_the_time_of_a_pose_is_known_after_the_wall_clock_was_set(tmp_path: Path, step_s: int):
+    """The host booted 1000 s before; its clock was wrong until a network was at hand."""
+    file, now_ns = tmp_path / "sent.json", 100_000 * S
+    state = SentState(file, now_ns, HostBoot("a", now_ns - 1000 * S))
+    state.on_sent(b"x", now_ns)
+    state.write()
+    then_ns = now_ns + (step_s + 2) * S  # 2 s later
+    earlier = SentState(file, then_ns, HostBoot("a", then_ns - 1002 * S)).take_earlier()
+    assert earlier == (then_ns - 2 * S, b"x", None)
+
+
+def test_a_pose_of_an_earlier_boot_of_the_host_was_sent_before_it(tmp_path: Path):
+    file = tmp_path / "sent.json"
+    state = SentState(file, 5000 * S, HostBoot("a", 10 * S))
+    state.on_sent(b"x", 5000 * S)
+    state.write()
+    set_back = SentState(file, 4000 * S, HostBoot("b", 3900 * S)).take_earlier()
+    assert set_back == (3900 * S, b"x", None)
+    later = SentState(file, 9000 * S, HostBoot("b", 8000 * S)).take_earlier()
+    assert later == (5000 * S, b"x", None)
+
+
+def test_the_boot_of_this_host_is_the_same_for_two_processes(tmp_path: Path):
+    now_ns = host_time.now_ns()
+    first, second = host_boot(now_ns), host_boot(now_ns + 57_600 * S)
+    assert first is not None
+    assert second is not None
+    assert first.id == second.id
+    assert second.at_ns - first.at_ns == pytest.approx(57_600 * S, abs=S)
+    assert host_boot(now_ns, tmp_path / "none") is None
 
 
 def test_it_is_written_ten_times_a_second(tmp_path: Path):

@@ -1,7 +1,8 @@
 """Datagrams from one sender, each with a JSON object or text; a JSON object may have `age_s`.
 
-`age_s`: age of the measurement at the time of sending [s]; 0 when it is missing. A datagram that is older than one
-second is skipped and counted.
+`age_s`: age of the measurement at the time of sending [s]; `latency_s` of the settings when it is missing. It may be
+negative by MAX_AHEAD_S, the difference of two clocks, and counts as 0 then. A datagram that is older than one second is
+skipped and counted.
 
 Source: ours.
 """
@@ -22,7 +23,7 @@ from flow.link import LinkError, PolledRecords, Record, SourceSettings
 from links.clock import datagram_time
 
 DATAGRAM_BYTES = 4096
-MAX_AGE_S = 1.0
+MAX_AGE_S, MAX_AHEAD_S = 1.0, 0.02
 WRONG_AGE = "age_s invalid or too large"  # counter
 
 
@@ -34,6 +35,7 @@ class UdpSettings(SourceSettings):
     port: int | None = Field(None, ge=1, le=65535)  # UDP, live; None: not received live
     bind: IPv4Address = IPv4Address("127.0.0.1")  # this host's address
     sender: IPv4Address | None = None  # the sender's address; others are ignored
+    latency_s: float = Field(0.0, ge=0, le=MAX_AGE_S)  # age when it is sent, of a datagram without `age_s`
 
     @model_validator(mode="after")
     def _sender_is_known(self) -> UdpSettings:
@@ -100,7 +102,7 @@ class Datagrams(PolledRecords):
                 if self._sender is not None and host != self._sender:
                     self._counters["from other senders"] += 1
                     continue
-                age = age_s(data)
+                age = age_s(data, self._settings.latency_s)
                 if age is None:
                     self._counters[WRONG_AGE] += 1
                     continue
@@ -109,11 +111,11 @@ class Datagrams(PolledRecords):
             raise LinkError(f"{self._settings.what}: {error.strerror}: is the network interface still up?") from error
 
 
-def age_s(data: bytes) -> float | None:
-    """`age_s` of a datagram, 0 without it; None: invalid or above MAX_AGE_S."""
+def age_s(data: bytes, latency_s: float = 0.0) -> float | None:
+    """`age_s` of a datagram, `latency_s` without it; None: invalid, above MAX_AGE_S, or below -MAX_AHEAD_S."""
     try:
         fields: Any = json.loads(data)
-        age = float(fields.get("age_s", 0.0))
+        age = float(fields.get("age_s", latency_s))
     except (ValueError, TypeError, AttributeError, OverflowError, RecursionError):
-        return 0.0 if b"age_s" not in data else None  # `decode` rejects invalid JSON
-    return age if 0.0 <= age <= MAX_AGE_S else None
+        return latency_s if b"age_s" not in data else None  # `decode` rejects invalid JSON
+    return max(age, 0.0) if -MAX_AHEAD_S <= age <= MAX_AGE_S else None

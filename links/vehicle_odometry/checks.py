@@ -5,22 +5,41 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from flow.graph import Graph
+from flow.link import Record, Source
 from links.preflight.check_result import CheckResult, fail, ok, warning
 from links.preflight.link_checks import LinkChecks, declares
-from links.preflight.observations import Observations, ObservedSource
-from links.vehicle_odometry.odometry import VehicleOdometry
-from stages.geometry.trajectory import same_vertical
+from links.preflight.observations import Observation, Observations, ObservedSource
+from links.udp import MAX_AGE_S, WRONG_AGE
+from links.vehicle_odometry.odometry import TILTED, VehicleOdometry
+from stages.geometry.trajectory import RECENT_NS, same_vertical
 from stages.messages import VehicleMotion
 
 OLD_MS = 200.0  # age of a pose
 ODOMETRY_HZ = 5.0
-ODOMETRY_SILENT_S = 1.0  # a sender that is silent for longer has stopped
+RECENT_S = 1e-9 * RECENT_NS  # the vehicle's motion is known this long after a pose
+
+
+class OdometryObservation(Observation):
+    """Also whether the poses have an age."""
+
+    def __init__(self, topic: str) -> None:
+        super().__init__(topic)
+        self.has_age = False
+
+    def add(self, record: Record) -> None:
+        """See Observation."""
+        super().add(record)
+        self.has_age |= b'"age_s"' in record.data
 
 
 class VehicleOdometryChecks(LinkChecks):
     """Checks of the vehicle's own odometry."""
 
     link_class = VehicleOdometry
+
+    def observation(self, source: Source) -> OdometryObservation:
+        """See LinkChecks."""
+        return OdometryObservation(source.topic)
 
     def check_configuration(self, graph: Graph) -> Iterator[CheckResult]:
         """Vehicle odometry is optional."""
@@ -31,10 +50,23 @@ class VehicleOdometryChecks(LinkChecks):
         """See LinkChecks."""
         assert isinstance(source.link, VehicleOdometry)
         yield odometry_check(source, source.link)
+        observation, link = source.observation, source.link
+        if source.live and observation.records.count and not link.settings.latency_s:
+            assert isinstance(observation, OdometryObservation)
+            if not observation.has_age:
+                yield warning(
+                    f"{source.name} age",
+                    "its poses have no age_s: they count as new when they are sent, and an error of 0.1 s in a turn of "
+                    f"30 deg/s is 0.8 m at 15 m; send age_s, or set {source.name}.latency_s",
+                )
         motions = observations.all(VehicleMotion)
         if motions and all(same_vertical(motion.R_map_vehicle, motions[0].R_map_vehicle) for motion in motions):
-            assumed = "if it does not measure them, those of a car are assumed (fuse.errors.vehicle_tilt_deg_per_mps2)"
-            yield ok(f"{source.name} tilt", f"its roll and pitch do not change: {assumed}")
+            yield warning(
+                f"{source.name} tilt",
+                "its roll and pitch do not change. If it does not measure them, those of a car on a level road are "
+                "assumed (fuse.errors.vehicle_tilt_deg_per_mps2); a slope of 1 deg is 0.17 m at 10 m: set "
+                "fuse.errors.vehicle_tilt_deg to that of your roads",
+            )
 
 
 def odometry_check(source: ObservedSource, link: VehicleOdometry) -> CheckResult:
@@ -42,8 +74,11 @@ def odometry_check(source: ObservedSource, link: VehicleOdometry) -> CheckResult
     if source.live and link.settings.port is None:
         return warning(source.name, "no port is set: the vehicle is assumed parked")
     records = source.observation.records
+    wrong_age = source.counters.get(WRONG_AGE, 0)
+    why_age = f"{wrong_age} poses with an age_s that is invalid or above {MAX_AGE_S:g} s: check the sender's clock"
     if not records.count:
-        text = f"{source.no_data_reason}: the vehicle would be assumed parked"
+        reason = why_age if wrong_age else source.no_data_reason
+        text = f"{reason}: the vehicle would be assumed parked"
         return fail(source.name, f"{text}; start it, or set port: null") if source.live else warning(source.name, text)
     rejected, age_ms = sum(source.counters.rejected.values()), 1e-6 * records.max_age_ns
     text = f"{records.rate_hz:.0f} poses/s, at most {age_ms:.0f} ms old" + (
@@ -51,9 +86,16 @@ def odometry_check(source: ObservedSource, link: VehicleOdometry) -> CheckResult
     )
     if rejected >= records.count:
         return fail(source.name, f"{text}: none is a valid pose (recordings/README.md, /vehicle/odometry)")
+    if source.counters.rejected.get(TILTED):
+        return fail(
+            source.name, f"{text}: {TILTED}: is the quaternion x, y, z, w, and z up (rig.odometry.axes: frd if down)?"
+        )
     silent_s = records.longest_silence_s(source.end_ns)
-    if source.live and silent_s > ODOMETRY_SILENT_S:
-        return fail(source.name, f"{text}; then none for {silent_s:.1f} s: is its sender still running?")
+    if source.live and silent_s + 1e-3 * age_ms >= RECENT_S:
+        text += f"; none for {silent_s:.1f} s: above {RECENT_S:g} s with its age the vehicle's motion is unknown"
+        return fail(source.name, f"{text}. Is its sender still running?")
+    if wrong_age:
+        return warning(source.name, f"{text}; {why_age}")
     if not records.rate_hz >= ODOMETRY_HZ or age_ms > OLD_MS or rejected:
         return warning(source.name, f"{text}: check its rate, its age_s and its clock")
     return ok(source.name, text)

@@ -2,6 +2,9 @@
 
     {"xyz_m": [x, y, z], "quaternion_xyzw": [x, y, z, w], "covariance": [36 numbers] or null, "age_s": 0.004}
 
+They are those of the odometry's reference point (`rig.odometry`) in a frame whose z axis is vertical. A vehicle that is
+tilted by more than MAX_TILT_DEG is a wrong order of the quaternion, or wrong axes.
+
 A recording without it is no error: the source has no records, and the run reports that once.
 
 Source: recording format in recordings/README.md (/vehicle/odometry).
@@ -21,11 +24,16 @@ from flow.counters import Counters
 from flow.link import PolledRecords, Record, Source
 from links.udp import UdpSettings, listen_udp
 from stages.geometry.frames import Array64, rotation_from_quaternion_xyzw
+from stages.geometry.rig import RigOdometry
+from stages.geometry.se3 import composed_covariance
 from stages.messages import VehicleMotion
 
 MAX_BYTES = 4_000
 MAX_M = 1e7
 NORM_TOLERANCE = 1e-3  # of a quaternion
+MAX_TILT_DEG = 45.0  # the steepest road has 20 deg
+TILTED = f"the vehicle is tilted by more than {MAX_TILT_DEG:g} deg"  # counter
+FLIP_YZ = np.array([1.0, -1.0, -1.0])  # between forward-left-up and forward-right-down
 CORRELATION_TOLERANCE = 1e-4  # effect of rounding a covariance to six digits
 
 
@@ -35,6 +43,7 @@ class VehicleOdometrySettings(UdpSettings):
     what: ClassVar[str] = "the vehicle's odometry"
 
     topic: str = "/vehicle/odometry"
+    reference: RigOdometry | None = None  # what its poses are poses of; None: of frame vehicle
 
 
 class VehicleOdometry(Source[VehicleOdometrySettings]):
@@ -46,17 +55,18 @@ class VehicleOdometry(Source[VehicleOdometrySettings]):
     def __init__(self, settings: VehicleOdometrySettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
         self._rejected: int = 0
+        self._tilted: int = 0
         self._udp: Counter[str] = Counter()
 
     @property
     def rejected(self) -> int:
         """Number of records without a valid pose."""
-        return self._rejected
+        return self._rejected + self._tilted
 
     @property
     def counters(self) -> Counters:
         """Totals since the start: rejected, from other senders."""
-        return Counters(self._udp, {"no valid pose": self._rejected})
+        return Counters(self._udp, {"no valid pose": self._rejected, TILTED: self._tilted})
 
     def listen(self) -> AbstractContextManager[PolledRecords]:
         """Receive poses: `with odometry.listen() as records`. LinkError without `port`, or when it cannot be opened."""
@@ -65,10 +75,35 @@ class VehicleOdometry(Source[VehicleOdometrySettings]):
     def decode(self, record: Record) -> VehicleMotion | None:
         """The pose in `{"xyz_m": [...], "quaternion_xyzw": [...], "covariance": [36] or null}`; None: invalid."""
         try:
-            return parse_pose(record.stamp_ns, record.data)
+            motion = parse_pose(record.stamp_ns, record.data)
         except ValueError:
             self._rejected += 1
             return None
+        if self.settings.reference is not None:
+            motion = of_vehicle(motion, self.settings.reference)
+        if motion.R_map_vehicle[2, 2] < math.cos(math.radians(MAX_TILT_DEG)):
+            self._tilted += 1
+            return None
+        return motion
+
+
+def of_vehicle(reference: VehicleMotion, settings: RigOdometry) -> VehicleMotion:
+    """The vehicle's pose for one of the odometry's reference point: T_map_reference T_reference_vehicle.
+
+    With axes frd the frame of the odometry has z down; `map` is that frame turned about its x axis.
+    """
+    xyz_m, R, P = reference.xyz_map_m, reference.R_map_vehicle, reference.covariance
+    if settings.axes == "frd":
+        xyz_m, R = FLIP_YZ * xyz_m, FLIP_YZ[:, None] * R * FLIP_YZ
+        P = None if P is None else np.tile(FLIP_YZ, 2)[:, None] * P * np.tile(FLIP_YZ, 2)
+    back = np.linalg.inv(settings.T_vehicle_reference.matrix())
+    R_back, t_back_m = np.ascontiguousarray(back[:3, :3]), back[:3, 3].copy()
+    return VehicleMotion(
+        stamp_ns=reference.stamp_ns,
+        xyz_map_m=xyz_m + R @ t_back_m,
+        R_map_vehicle=R @ R_back,
+        covariance=None if P is None else composed_covariance(P, R_back, t_back_m, np.zeros((6, 6))),
+    )
 
 
 def parse_pose(stamp_ns: int, data: bytes) -> VehicleMotion:

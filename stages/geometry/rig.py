@@ -78,6 +78,13 @@ class RigCameras(StrictModel):
         return [f"camera_{camera_mount.value}" for camera_mount in CameraMount if self.of(camera_mount) is not None]
 
 
+class RigOdometry(StrictModel):
+    """`rig.odometry`: what the poses of the vehicle's odometry are poses of."""
+
+    T_vehicle_reference: Pose = Pose()  # its reference point (base_link, INS) in frame vehicle, with its axes
+    axes: Literal["flu", "frd"] = "flu"  # x forward, y left, z up, also of its frame; frd: y right, z down, as in NED
+
+
 class Rig(StrictModel):
     """The whole rig."""
 
@@ -85,3 +92,4 @@ class Rig(StrictModel):
     lidar: RigLidar | None = None
     drone: RigDrone | None = None
     cameras: RigCameras | None = None
+    odometry: RigOdometry | None = None  # None: its poses are those of frame vehicle

@@ -66,5 +66,5 @@ def test_the_schema_has_the_keys_of_the_rig_and_requires_none():
     whole = schema(Rig)
     rig = whole["properties"]["rig"]
     assert rig["additionalProperties"] is False
-    assert set(rig["properties"]) == {"version", "lidar", "drone", "cameras"}
+    assert set(rig["properties"]) == {"version", "lidar", "drone", "cameras", "odometry"}
     assert "required" not in whole["$defs"]["DroneCamera"]

@@ -85,6 +85,7 @@ def test_check_warns_of_every_value_of_the_field_configuration_that_must_be_set(
         "autopilot.connection is udpin:127.0.0.1:14550",
         "camera_vehicle.latency_s is 0",
         "camera_drone.source is /dev/video2",
+        "rig.odometry is not set",
     ):
         assert f"warning: {words}" in text
 
@@ -100,6 +101,9 @@ def test_values_that_were_set_and_simulated_rigs_give_no_warning(tmp_path):
     texts = shipped_values(load_graph(tmp_path / "mine.yaml"))
     assert texts
     assert not [text for text in texts if text.startswith(("lidar.", "camera_vehicle."))]
+    assert [text for text in texts if text.startswith("rig.odometry")]
+    (tmp_path / "rig.yaml").write_text("include: mine.yaml\nrig: {odometry: {}}\n")
+    assert not [text for text in shipped_values(load_graph(tmp_path / "rig.yaml")) if text.startswith("rig.odometry")]
 
 
 def test_a_run_with_nothing_connected_ends_with_one_and_what_to_check(grd, tmp_path):

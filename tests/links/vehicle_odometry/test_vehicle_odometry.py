@@ -18,7 +18,8 @@ from links.simulated.sensors.vehicle_odometry import VehicleOdometrySettings
 from links.simulated.world.path import Path as SimulatedPath
 from links.simulated.world.path import Waypoint
 from links.vehicle_odometry import VehicleOdometry
-from stages.geometry.frames import rotation_z
+from stages.geometry.frames import Pose, rotation_z
+from stages.geometry.rig import RigOdometry
 from stages.messages import VehicleMotion
 
 COVARIANCE = np.diag([1e-4, 1e-4, 4e-4, 0.01, 0.01, 0.04])
@@ -47,6 +48,46 @@ def test_a_pose_keeps_its_own_time_and_every_field() -> None:
     assert motion.covariance is not None
     assert np.array_equal(motion.covariance, COVARIANCE)
     assert output_ports(VehicleOdometry) == {"vehicle_motion": VehicleMotion}
+
+
+def test_a_pose_of_another_reference_point_becomes_one_of_the_vehicle() -> None:
+    """`base_link` is 1.4 m behind and 1.5 m below the camera. In a U-turn on the spot about it the camera moves."""
+    behind = RigOdometry(T_vehicle_reference=Pose(xyz_m=(-1.4, 0.0, -1.5)))
+    link = VehicleOdometry(reference=behind)
+    start, turned = (
+        link.decode(record(json.dumps(GOOD | {"xyz_m": [0, 0, 0], "quaternion_xyzw": q}).encode()))
+        for q in ([0, 0, 0, 1], [0, 0, 1, 0])
+    )
+    assert start is not None
+    assert turned is not None
+    np.testing.assert_allclose(start.xyz_map_m, [1.4, 0.0, 1.5], atol=1e-12)
+    np.testing.assert_allclose(turned.xyz_map_m, [-1.4, 0.0, 1.5], atol=1e-12)
+    np.testing.assert_allclose(turned.R_map_vehicle, np.diag([-1.0, -1.0, 1.0]), atol=1e-12)
+    # the error of its yaw, about z, moves the camera to the side; translation errors are in the vehicle's axes
+    assert turned.covariance is not None
+    assert turned.covariance[4, 4] == pytest.approx(
+        COVARIANCE[4, 4] + 1.4**2 * COVARIANCE[2, 2] + 1.5**2 * COVARIANCE[0, 0]
+    )
+
+
+def test_poses_with_axes_forward_right_down_become_those_of_the_vehicle() -> None:
+    """An INS that is 0.5 m to the right of the camera; it drives 4 m ahead and turns to the left by 90 deg."""
+    ins = RigOdometry(axes="frd", T_vehicle_reference=Pose(xyz_m=(0.0, -0.5, 0.0)))
+    quarter = [0.0, 0.0, -math.sin(math.pi / 4), math.cos(math.pi / 4)]
+    pose = GOOD | {"xyz_m": [4.0, 0.0, 0.0], "quaternion_xyzw": quarter}
+    motion = VehicleOdometry(reference=ins).decode(record(json.dumps(pose).encode()))
+    assert motion is not None
+    np.testing.assert_allclose(motion.R_map_vehicle, rotation_z(math.pi / 2), atol=1e-12)
+    np.testing.assert_allclose(motion.xyz_map_m, [4.0 - 0.5, 0.0, 0.0], atol=1e-12)
+
+
+@pytest.mark.parametrize("quaternion", [[0.9659, 0.0, 0.0, 0.2588], [1.0, 0.0, 0.0, 0.0], [0.4, 0.0, 0.0, 0.9165]])
+def test_a_vehicle_on_its_side_or_roof_is_rejected(quaternion: list[float]) -> None:
+    """As with a quaternion w, x, y, z, or axes with z down in a frame with z up."""
+    link = VehicleOdometry()
+    assert link.decode(record(json.dumps(GOOD | {"quaternion_xyzw": quaternion}).encode())) is None
+    assert link.counters.rejected["the vehicle is tilted by more than 45 deg"] == 1
+    assert link.rejected == 1
 
 
 def test_a_source_that_does_not_state_its_covariance_has_none() -> None:

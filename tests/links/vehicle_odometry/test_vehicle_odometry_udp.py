@@ -84,6 +84,18 @@ def test_a_datagram_without_age_has_age_zero(data):
     assert age_s(data) == 0.0
 
 
+@pytest.mark.parametrize(("data", "age"), [(b"{}", 0.1), (b'{"age_s": 0.02}', 0.02), (b'{"age_s": -0.001}', 0.0)])
+def test_a_datagram_without_age_has_the_latency_and_one_ahead_of_this_clock_is_new(data, age):
+    assert age_s(data, latency_s=0.1) == age
+
+
+def test_the_latency_of_the_settings_is_in_the_stamp(port):
+    with VehicleOdometry(port=port, latency_s=0.1).listen() as records:
+        send(port, POSE)
+        pose = next(records)
+    assert pose.arrival_ns - pose.stamp_ns == 100_000_000
+
+
 def test_an_old_pose_is_skipped_and_counted(port):
     odometry = VehicleOdometry(port=port)
     with odometry.listen() as records:

@@ -61,6 +61,10 @@ class Link(Node[S]):
         """React to the end of the stage behind an input (live). The reaction as text; None: no reaction is needed."""
         return None
 
+    def upstream_restarted(self, port: str) -> str | None:
+        """React to a restart of the stage behind an input (live), which has lost what it knew; as `upstream_lost`."""
+        return None
+
 
 class SourceSettings(Settings):
     """Settings that every source has."""

@@ -86,13 +86,14 @@ class StageRun:
         counts: list[EdgeCount],
         order: OrderLog | None,
         shared: Shared,
-        on_switched_off: Callable[[], None],
+        on_failed: Callable[[], None],
     ) -> None:
-        """`on_switched_off` is called once when the stage has raised too often."""
+        """`on_failed` is called when the stage was replaced by a fresh one, or switched off."""
         self.stage, self.inbox = stage, inbox
         self.ended = threading.Event()
         self._ports = [(count.edge.port, count) for count in counts]
-        self._order, self._shared, self._on_switched_off = order, shared, on_switched_off
+        self._order, self._shared, self._on_failed = order, shared, on_failed
+        self._restarts = 0
 
     def take(self, item: Item) -> None:
         """Hand the stage one message, and publish what it gives for it."""
@@ -104,6 +105,9 @@ class StageRun:
         count.done(self._shared.now_ns() - item.arrival_ns)
         if self.stage.switched_off:
             self.end()
+        elif self.stage.restarts != self._restarts:
+            self._restarts = self.stage.restarts
+            self._on_failed()
 
     @property
     def deadline_ms(self) -> float:
@@ -119,7 +123,7 @@ class StageRun:
         self.inbox.close()
         self.inbox.clear()
         if self.stage.switched_off:
-            self._on_switched_off()
+            self._on_failed()
         else:
             if self._order is not None:
                 self._order.add_finish()
@@ -189,19 +193,19 @@ class SinkThread(RunThread):
         self.compute = Latency()
         self.failures = 0
         self.ended = threading.Event()
-        self._lost: deque[tuple[str, str]] = deque()
+        self._failed: deque[tuple[str, SupervisedStage]] = deque()
 
-    def lose_upstream(self, port: str, stage: str) -> None:
-        """The stage behind a port is switched off; any thread may call this."""
-        self._lost.append((port, stage))
+    def upstream_failed(self, port: str, stage: SupervisedStage) -> None:
+        """The stage behind a port restarts or is switched off; any thread may call this."""
+        self._failed.append((port, stage))
 
     def run(self) -> None:
         handlers = [(f"{self.node}.{c.edge.port}", getattr(self.link, f"on_{c.edge.port}")) for c in self.counts]
         done = False
         while not done:
-            lost = bool(self._lost)  # read before the inbox: what those stages gave is all in the inbox then
+            failed = bool(self._failed)  # read before the inbox: what those stages gave is all in the inbox then
             item = self.inbox.take()
-            if item is None and not lost:
+            if item is None and not failed:
                 done = self.inbox.done
                 if not done:
                     self.inbox.wakeup.wait([self.inbox], SENT_S)
@@ -211,8 +215,8 @@ class SinkThread(RunThread):
                     call(*handlers[item.port], item.message, item.arrival_ns)
                     self.compute.add(perf_counter_ns() - begin)
                     self.counts[item.port].done(self.shared.now_ns() - item.arrival_ns)
-                if item is None and lost:
-                    self._upstream_lost(*self._lost.popleft())
+                if item is None and failed:
+                    self._upstream_failed(*self._failed.popleft())
                 with named(f"{self.node}.sent"):
                     for record in self.link.sent():
                         self.shared.record(record)
@@ -221,11 +225,14 @@ class SinkThread(RunThread):
                 self.shared.events.report(self.node, str(error))
         self.ended.set()
 
-    def _upstream_lost(self, port: str, stage: str) -> None:
-        with named(f"{self.node}.upstream_lost"):
-            reaction = self.link.upstream_lost(port)
+    def _upstream_failed(self, port: str, stage: SupervisedStage) -> None:
+        off = stage.switched_off
+        with named(f"{self.node}.upstream_{'lost' if off else 'restarted'}"):
+            reaction = self.link.upstream_lost(port) if off else self.link.upstream_restarted(port)
         if reaction is not None:
-            self.shared.events.report(self.node, f"'{stage}' is switched off: {reaction}")
+            self.shared.events.report(
+                self.node, f"'{stage.name}' {'is switched off' if off else 'restarts'}: {reaction}"
+            )
 
 
 class TapThread(RunThread):

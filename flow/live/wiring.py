@@ -130,15 +130,15 @@ class Wiring:
         build = self.processes.build if spec.process else NodeSpec.build
         report = self._reporter(spec.name)
         stage = SupervisedStage(spec, self.outputs[spec.name], report, strict=shared.strict, build=build)
-        self.stages.append(StageRun(stage, inbox, counts, order, shared, lambda: self._switched_off(spec.name)))
+        self.stages.append(StageRun(stage, inbox, counts, order, shared, lambda: self._failed(stage)))
 
-    def _switched_off(self, stage: str) -> None:
-        """Notify the sinks that a stage feeds that it is switched off."""
+    def _failed(self, stage: SupervisedStage) -> None:
+        """Notify the sinks that a stage feeds that it restarts, or is switched off."""
         for edge in self.edges.values():
-            if edge.count.edge.producer == stage:
+            if edge.count.edge.producer == stage.name:
                 for sink in self.sinks:
                     if sink.node == edge.count.edge.consumer:
-                        sink.lose_upstream(edge.count.edge.port, stage)
+                        sink.upstream_failed(edge.count.edge.port, stage)
 
     def _reporter(self, name: str) -> Callable[[str, RunError], None]:
         def report(reaction: str, error: RunError) -> None:

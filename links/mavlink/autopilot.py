@@ -168,6 +168,12 @@ class Autopilot(Source[AutopilotSettings]):
         else:
             session.send_pose(pose)
 
+    def upstream_restarted(self, port: str) -> str | None:
+        """See Link: a fresh `fuse` learns the autopilot's axes as after a restart of grd."""
+        session = self._session
+        known = port == "pose" and session is not None and not session.closed and session.report_odom()
+        return "it is told the autopilot's axes of the newest pose" if known else None
+
     def sent(self) -> Iterable[Record]:
         """See Link: all sent frames, including heartbeats."""
         session = self._session

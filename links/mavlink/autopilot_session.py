@@ -151,6 +151,12 @@ class AutopilotSession:
                     self.switch.on_sent(pose, frame, self.poses.turn_rad(pose), self.poses.autopilot, now_ns)
             self._send_texts(now_ns)
 
+    def report_odom(self) -> bool:
+        """Report the autopilot's frame in `map` at the newest pose once more; False: none was sent."""
+        with self._lock:
+            self._earlier_odom = self._sent_state.odom or self._earlier_odom
+            return self._earlier_odom is not None
+
     def sent(self) -> list[Record]:
         """Records of the frames sent since the previous call."""
         with self._lock:

@@ -174,12 +174,18 @@ class Collector(Link):
         super().__init__(settings, **values)
         self._got = queue.SimpleQueue()
         self._sent: list[Record] = []
+        self.restarted: list[str] = []  # ports whose stage has restarted
+        self.begins_again: str | None = None
 
     def on_number(self, number: Number) -> None:
         if number.value == 13:
             raise LinkError("thirteen is not sent: choose another number")
         self._sent.append(Record("/sent", number.stamp_ns, number.stamp_ns, b"%d" % int(number.value)))
         self._got.put(number.value)
+
+    def upstream_restarted(self, port: str) -> str | None:
+        self.restarted.append(port)
+        return self.begins_again
 
     def upstream_lost(self, port: str) -> str:
         self._got.put(port)

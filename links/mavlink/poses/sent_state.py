@@ -36,6 +36,7 @@ class SentState:
         self._file, self._boot = file, boot
         self._newest: tuple[int, bytes] | None = None
         self._odom: bytes | None = None
+        self._odom_ns: int | None = None
         self._written_ns: int | None = None
         self._earlier = self._read(now_ns)
 
@@ -50,8 +51,14 @@ class SentState:
     def on_sent(self, frame: bytes, sent_ns: int, odom: Callable[[], bytes | None] = lambda: None) -> None:
         """A pose was sent; `odom`: makes frame odom in `map`, called when it will be written."""
         self._newest = sent_ns, frame
-        if self._file is not None and (self._written_ns is None or sent_ns - self._written_ns >= WRITE_PERIOD_NS):
-            self._odom = odom()
+        before_ns = self._odom_ns if self._file is None else self._written_ns
+        if before_ns is None or sent_ns - before_ns >= WRITE_PERIOD_NS:
+            self._odom, self._odom_ns = odom(), sent_ns
+
+    @property
+    def odom(self) -> tuple[int, bytes] | None:
+        """Time and frame odom in `map` of this run's newest pose that had one."""
+        return None if self._odom is None or self._odom_ns is None else (self._odom_ns, self._odom)
 
     def write(self) -> None:
         """Write the newest pose, at most once each WRITE_PERIOD_NS. Until it succeeds it is repeated."""

@@ -205,8 +205,9 @@ def test_a_stage_that_keeps_raising_is_switched_off_and_the_others_run_on(tmp_pa
     assert any("5 restarts in 60 s did not help: brittle stays off" in str(i) for i in report.events)
 
 
-def test_a_link_reacts_to_the_loss_of_its_upstream_stage_and_that_is_reported(tmp_path):
+def test_a_link_reacts_to_restarts_and_the_loss_of_its_upstream_stage_and_that_is_reported(tmp_path):
     live = run_live(graph_of(tmp_path, DOUBLING))
+    collector_of(live).begins_again = "it begins again"
     line_of(live).put(*[666] * 5)
     line_of(live).put(7)
     assert collector_of(live).take(1) == [14.0], "five restarts do not switch it off"
@@ -215,6 +216,8 @@ def test_a_link_reacts_to_the_loss_of_its_upstream_stage_and_that_is_reported(tm
     report = live.stop()
     assert report.switched_off == ["brittle"]
     assert "collector: 'brittle' is switched off: it stands still" in [str(i) for i in report.events]
+    assert collector_of(live).restarted == ["number"] * 5
+    assert "collector: 'brittle' restarts: it begins again (5 times)" in [str(i) for i in report.events]
 
 
 GATED = DOUBLING.replace("Brittle", "Gate").replace("brittle", "gate")

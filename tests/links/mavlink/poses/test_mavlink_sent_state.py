@@ -146,6 +146,22 @@ def test_after_a_restart_the_estimate_is_independent_only_if_the_autopilot_has_r
     assert [message.independent for message in messages if isinstance(message, DroneAttitude)] == live
 
 
+@pytest.mark.parametrize("file", [None, "sent.json"])
+def test_a_fuse_stage_that_restarts_is_told_the_axes_of_the_newest_pose(tmp_path: Path, file: str | None):
+    """With a state file and without."""
+    state_file, drone = None if file is None else str(tmp_path / file), Drone(uptime_s=60.0)
+    with listening(state_file=state_file) as listener:
+        assert listener.link.upstream_restarted("pose") is None, "nothing was sent"
+        drone.send(listener, 30, poses=True)
+        assert "axes" in (listener.link.upstream_restarted("pose") or "")
+        drone.send(listener, 5, poses=False)
+    found = [message for message in listener.messages if isinstance(message, EarlierOdomFrame)]
+    assert len(found) == 1
+    assert found[0].yaw_map_odom_rad == pytest.approx(0.8, abs=0.02)
+    assert abs(host_time.now_ns() - found[0].stamp_ns) < 30 * S
+    assert listener.link.upstream_restarted("pose") is None, "it is closed"
+
+
 def test_the_frame_of_the_autopilot_is_known_after_a_restart_live_and_in_replay(tmp_path: Path):
     """The body's yaw is 0.5 in `map` and -0.3 by the autopilot; it is at (101, 2, 10) in `map` and at (4, -2, 30)."""
     state_file, drone = str(tmp_path / "sent.json"), Drone(uptime_s=60.0)

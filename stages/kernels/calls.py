@@ -42,7 +42,8 @@ def load_calls(calls: bytes, progress: Callable[[int, int], None]) -> bool:
         return False
     for done, (name, signatures) in enumerate(made.items(), 1):
         for signature in signatures:
-            functions[name].compile(signature)
+            if signature not in functions[name].overloads:  # a function of `compiled_at_once` takes no other types
+                functions[name].compile(signature)
         progress(done, len(made))
     return True
 

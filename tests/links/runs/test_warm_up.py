@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import pytest
 
 from flow.graph import load_graph
@@ -11,7 +14,7 @@ from links.recording import RecordingWriter
 from links.runs.request import RunRequest
 from links.runs.shipped import CONFIGS
 from links.runs.warm_up import RECORDING, REPLAYED_NS, warm_up, warm_up_graph
-from stages.kernels.compiled import compiled
+from tests.test_architecture import ROOT
 
 GRAPH = """\
 stages:
@@ -47,22 +50,33 @@ def test_the_graph_runs_over_the_whole_recording_and_reports_progress(graph, tmp
     assert progress[-1][0] == progress[-1][1] > 0
 
 
-@compiled
-def twice(number: int) -> int:
-    """Twice a number."""
-    return 2 * number
+def test_a_later_start_loads_the_functions_that_were_called_in_place_of_the_replay(graph, tmp_path):
+    """In a process of its own. One function is compiled when it is called, the other when it is imported."""
+    one = recording(tmp_path, b"1")
+    program = f"""
+import sys
+from pathlib import Path
+from flow.graph import load_graph
+from links.runs import warm_up
+from stages.kernels.geometry.so3 import exp_rotation, nearly_rotation
+import numpy as np
 
+folder, progress = Path({str(tmp_path)!r}), []
+warm_up.FOLDER = folder / "cache"
+if sys.argv[1] == "first":
+    exp_rotation(np.zeros(3))
+graph = load_graph(folder / "x.yaml")
+failed = warm_up.warm_up(graph, lambda *shares: progress.append(shares), folder / "warm.mcap")
+print(failed, progress[-1][0] == progress[-1][1], len(exp_rotation.signatures), len(nearly_rotation.signatures))
+"""
 
-def test_a_later_start_loads_the_functions_that_were_called_in_place_of_the_replay(graph, tmp_path, monkeypatch):
-    one, progress = recording(tmp_path, b"1"), []
-    twice(2)
-    assert warm_up(graph, lambda done, total: None, one) is None
-    one.unlink()
-    loaded = []
-    monkeypatch.setattr(type(twice), "compile", lambda function, types: loaded.append((function, types)))
-    assert warm_up(graph, lambda done, total: progress.append((done, total)), one) is None
-    assert (twice, twice.signatures[0]) in loaded
-    assert progress[-1][0] == progress[-1][1]
+    def start(which):
+        command = [sys.executable, "-c", program, which]
+        return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout.split()
+
+    assert start("first") == ["None", "True", "1", "1"]
+    one.unlink()  # it is not replayed
+    assert start("second") == ["None", "True", "1", "1"]
 
 
 @pytest.mark.parametrize("damage", [b"", b"no pickle", bytes(100), b"\x80\x04K", b"cmissing\nname\n.", None])

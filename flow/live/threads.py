@@ -230,9 +230,8 @@ class SinkThread(RunThread):
         with named(f"{self.node}.upstream_{'lost' if off else 'restarted'}"):
             reaction = self.link.upstream_lost(port) if off else self.link.upstream_restarted(port)
         if reaction is not None:
-            self.shared.events.report(
-                self.node, f"'{stage.name}' {'is switched off' if off else 'restarts'}: {reaction}"
-            )
+            text = f"is switched off: {reaction}" if off else f"restarts: {reaction}"
+            self.shared.events.report(self.node, f"'{stage.name}' {text}")
 
 
 class TapThread(RunThread):

@@ -47,6 +47,7 @@ from links.mavlink.transport.signing import Signer
 from stages.messages import RelativePose
 
 WAKE_S = 0.05  # period of the thread, and of the check whether a waiting reader was closed
+SAVED_S = 2.0  # closing waits this long for a write to the disk
 SILENCE_REPORTED_S = 3.0  # three heartbeats
 SECOND_NS = 1_000_000_000
 MAX_SILENCE_NS = 1_500_000_000  # one and a half heartbeats: no poses are sent
@@ -106,9 +107,12 @@ class AutopilotSession:
         self._target_connection: int | None = None  # `reconnects` at its newest frame; NO_CONNECTION: not authenticated
         if signer is not None:
             signer.write_timestamp()  # the signer may come from an earlier session
-        self._thread = threading.Thread(target=self._run, name="mavlink housekeeping", daemon=True)
-        if threaded:
-            self._thread.start()
+        self._threads = [
+            threading.Thread(target=self._run, name="mavlink housekeeping", daemon=True),
+            threading.Thread(target=self._save, name="mavlink state", daemon=True),
+        ]
+        for thread in self._threads if threaded else ():
+            thread.start()
 
     def records(self) -> Iterator[Record]:
         """Frames as they arrive, until closed. Raises LinkError when the connection cannot recover."""
@@ -236,8 +240,11 @@ class AutopilotSession:
     def close(self) -> None:
         """Stop the thread and close the connection."""
         self._closed.set()
-        if self._thread.is_alive():
-            self._thread.join()
+        housekeeping, saving = self._threads
+        if housekeeping.is_alive():
+            housekeeping.join()
+        if saving.is_alive():
+            saving.join(SAVED_S)
         with self._lock:
             self.connection.close()
             if self._signer is not None:
@@ -314,6 +321,11 @@ class AutopilotSession:
     def _run(self) -> None:
         while not self._closed.wait(WAKE_S):
             self.tick()
+
+    def _save(self) -> None:
+        """Write to the disk, in a thread of its own: on one that stalls only this waits."""
+        while not self._closed.wait(WAKE_S):
+            self.write_state()
             if self._signer is not None:
                 self._signer.write_timestamp()
 
@@ -349,6 +361,9 @@ class AutopilotSession:
                 if request is not None and not self._send(request):
                     self.switch.on_not_sent()
             self._send_texts(now_ns)
+
+    def write_state(self) -> None:
+        """Write the newest sent pose if it is due; to be called every WAKE_S, by one thread. It may block."""
         self._sent_state.write()
 
     def _send_texts(self, now_ns: int) -> None:

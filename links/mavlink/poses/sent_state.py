@@ -17,12 +17,14 @@ from __future__ import annotations
 
 import json
 import os
+import time
 from collections.abc import Callable
 from pathlib import Path
 
 from links.clock.host_boot import HostBoot, on_own_clock
 from links.mavlink.transport.framing import dialect
 
+STALLED_S = 1.0  # a write that takes longer is reported
 WRITE_PERIOD_NS = 100_000_000  # period of writing; after a source switch an older frame odom is another one
 
 
@@ -31,14 +33,22 @@ class SentState:
 
     def __init__(self, file: Path | None, now_ns: int, boot: HostBoot | None = None) -> None:
         """`boot` None: the clock of all runs is the same, as in virtual time."""
-        self.status: str | None = None
-        """Why the file cannot be read or written."""
+        self._status: str | None = None
+        self._writing_s: float | None = None  # since when, on the monotonic clock
         self._file, self._boot = file, boot
         self._newest: tuple[int, bytes] | None = None
         self._odom: bytes | None = None
         self._odom_ns: int | None = None
         self._written_ns: int | None = None
         self._earlier = self._read(now_ns)
+
+    @property
+    def status(self) -> str | None:
+        """Why the file cannot be read or written."""
+        since_s = self._writing_s
+        if since_s is not None and time.monotonic() - since_s > STALLED_S:
+            return f"{self._file}: the disk does not answer. A restart would not know of sent poses"
+        return self._status
 
     def take_earlier(self) -> tuple[int, bytes, bytes | None] | None:
         """Time and frame of the newest pose of earlier runs, and frame odom in `map` then; None: none, or taken before.
@@ -68,6 +78,7 @@ class SentState:
         if self._written_ns is not None and newest[0] - self._written_ns < WRITE_PERIOD_NS:
             return
         partial = self._file.with_suffix(".partial")
+        self._writing_s = time.monotonic()
         try:
             self._file.parent.mkdir(parents=True, exist_ok=True)
             fields = {
@@ -79,9 +90,11 @@ class SentState:
             partial.write_text(json.dumps(fields), encoding="ascii")
             os.replace(partial, self._file)
         except OSError as error:
-            self.status = f"{self._file} cannot be written: {error.strerror}. A restart would not know of sent poses"
+            self._status = f"{self._file} cannot be written: {error.strerror}. A restart would not know of sent poses"
         else:
-            self._written_ns, self.status = newest[0], None
+            self._written_ns, self._status = newest[0], None
+        finally:
+            self._writing_s = None
 
     def _read(self, now_ns: int) -> tuple[int, bytes, bytes | None] | None:
         """A file that cannot be read counts as a pose sent now."""
@@ -97,7 +110,7 @@ class SentState:
         except FileNotFoundError:
             return None
         except (OSError, ValueError, TypeError, LookupError, OverflowError, RecursionError) as error:
-            self.status = f"{self._file} cannot be read ({error!r}): delete it after a reboot of the autopilot"
+            self._status = f"{self._file} cannot be read ({error!r}): delete it after a reboot of the autopilot"
             return now_ns, _unknown_pose(), None
 
 

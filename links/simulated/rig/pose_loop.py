@@ -105,6 +105,7 @@ class PoseLoop:
         while self._next_tick_ns <= record.arrival_ns:
             self._now_ns = max(self._now_ns, self._next_tick_ns + self._compute_ns)
             self._session.tick()
+            self._session.write_state()
             self._next_tick_ns += TICK_NS
         self._now_ns = max(self._now_ns, record.arrival_ns + self._compute_ns)
         if record.topic != self._topic:

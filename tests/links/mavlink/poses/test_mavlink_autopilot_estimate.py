@@ -231,7 +231,7 @@ def test_a_session_that_sends_yaw_reports_its_axes_and_keeps_the_yaw_of_the_atti
         list(session.receive(packed(message, mav), PEER, HOST0))
     session.send_pose(good_pose(odom_yaw_rad=math.radians(25.0)))
     assert session.counters["yaw in map of the sent axes [deg]"] == 25
-    session.tick()
+    session.write_state()
     kept = parse_frame(bytes.fromhex(json.loads((tmp_path / "sent.json").read_text())["odom"]))
     assert math.degrees(read_odom_frame(kept, HOST0).yaw_map_odom_rad) == pytest.approx(60.0, abs=1e-3)
 

@@ -16,6 +16,7 @@ from links.clock import host_time
 from links.clock.host_boot import HostBoot, host_boot
 from links.mavlink import Autopilot
 from links.mavlink.poses.sent_state import SentState
+from links.mavlink.source_switch import SourceSwitch
 from links.mavlink.transport.framing import packed, parse_frame
 from stages.geometry.frames import rotation_z
 from stages.messages import DroneAttitude, EarlierOdomFrame
@@ -97,6 +98,26 @@ def test_a_file_that_cannot_be_written_is_reported(tmp_path: Path):
     state.on_sent(b"x", 6 * S)
     state.write()
     assert "A restart would not know" in (state.status or "")
+
+
+def test_a_disk_that_stalls_stops_neither_poses_nor_what_is_due(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    answers, due = threading.Event(), list[int]()
+    monkeypatch.setattr("links.mavlink.poses.sent_state.os.replace", lambda *_: answers.wait(30.0))
+    monkeypatch.setattr("links.mavlink.poses.sent_state.STALLED_S", 0.2)
+    monkeypatch.setattr(SourceSwitch, "due", lambda _, now_ns: due.append(now_ns))
+    drone = Drone(uptime_s=60.0)
+    try:
+        with listening(state_file=str(tmp_path / "sent.json")) as listener:
+            drone.send(listener, 30, poses=True)
+            before, sent = len(due), listener.link.counters["sent: ODOMETRY"]
+            drone.send(listener, 60, poses=True)
+            assert "the disk does not answer" in (listener.link.status or "")
+            assert listener.link.counters["sent: ODOMETRY"] > sent
+            assert len(due) > before + 3
+            answers.set()
+            listener.wait(lambda: "does not answer" not in (listener.link.status or ""))
+    finally:
+        answers.set()
 
 
 class Drone:

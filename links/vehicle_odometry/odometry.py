@@ -96,8 +96,9 @@ def of_vehicle(reference: VehicleMotion, settings: RigOdometry) -> VehicleMotion
     if settings.axes == "frd":
         xyz_m, R = FLIP_YZ * xyz_m, FLIP_YZ[:, None] * R * FLIP_YZ
         P = None if P is None else np.tile(FLIP_YZ, 2)[:, None] * P * np.tile(FLIP_YZ, 2)
-    back = np.linalg.inv(settings.T_vehicle_reference.matrix())
-    R_back, t_back_m = np.ascontiguousarray(back[:3, :3]), back[:3, 3].copy()
+    T = settings.T_vehicle_reference.matrix()
+    R_back = np.ascontiguousarray(T[:3, :3].T)
+    t_back_m = -R_back @ T[:3, 3]
     return VehicleMotion(
         stamp_ns=reference.stamp_ns,
         xyz_map_m=xyz_m + R @ t_back_m,

@@ -16,13 +16,13 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega
 
-from flow.graph import load_graph
 from flow.link import Record, Tap
 from flow.message import Message
 from flow.replay import replay
 from flow.taps import Digest
 from links.mavlink.transport.framing import header, parse_frame
-from links.recording import RecordingReader
+from links.recording import RecordingReader, Session
+from links.runs.request import RunRequest
 
 mavlink: Any = ardupilotmega
 ROOT = Path(__file__).resolve().parents[1]
@@ -48,9 +48,13 @@ class Outputs(Tap):
         return {output: digest.hexdigest() for output, digest in sorted(self.digests.items())}
 
 
+def file_of(recording: str) -> Path:
+    return ROOT / "recordings" / f"{recording}.mcap"
+
+
 def first_part(recording: str, sent: bool) -> list[Record]:
     """Records until END_S, with a pose of ours at SENT_S, if any."""
-    with RecordingReader(ROOT / "recordings" / f"{recording}.mcap") as reader:
+    with RecordingReader(file_of(recording)) as reader:
         records = [r for r in reader.records() if not r.topic.startswith("/truth")]
     start_ns = records[0].arrival_ns
     if sent:
@@ -86,24 +90,24 @@ def falsified(records: list[Record]) -> Iterator[Record]:
         yield Record(record.topic, record.arrival_ns, record.stamp_ns, bytes(message.pack(mav)), record.sequence)
 
 
-def outputs_of(config: str, records: Iterable[Record], folder: Path) -> dict[str, str]:
-    overlay = folder / "no_viewer.yaml"
-    overlay.write_text("links: {viewer: null}\n")
+def outputs_of(config: str, recording: str, records: Iterable[Record]) -> dict[str, str]:
+    """On the recording's own rig."""
     outputs = Outputs()
-    replay(load_graph(ROOT / "configs" / f"{config}.yaml", [overlay]), records, [outputs])
+    request = RunRequest(ROOT / "configs" / f"{config}.yaml", sets=("viewer.file=null",))
+    replay(request.graph_on(Session(file_of(recording))), records, [outputs])
     return outputs.hashes
 
 
 @pytest.mark.parametrize(("config", "recording"), [("estimate", "experiment_2"), ("vision", "experiment_1")])
-def test_no_output_depends_on_the_autopilots_estimate_once_a_pose_was_sent(config: str, recording: str, tmp_path: Path):
+def test_no_output_depends_on_the_autopilots_estimate_once_a_pose_was_sent(config: str, recording: str):
     records = first_part(recording, sent=True)
-    hashes = outputs_of(config, records, tmp_path)
+    hashes = outputs_of(config, recording, records)
     assert {"detect.candidates", "track.track_state", "fuse.relative_pose"} <= hashes.keys()
     assert ("align.relative_rotation" in hashes) == (config == "vision")
-    assert outputs_of(config, falsified(records), tmp_path) == hashes
+    assert outputs_of(config, recording, falsified(records)) == hashes
 
 
-def test_without_a_sent_pose_the_outputs_depend_on_it(tmp_path: Path):
-    records = first_part("experiment_2", sent=False)
-    before, after = outputs_of("estimate", records, tmp_path), outputs_of("estimate", falsified(records), tmp_path)
+def test_without_a_sent_pose_the_outputs_depend_on_it():
+    name, records = "experiment_2", first_part("experiment_2", sent=False)
+    before, after = (outputs_of("estimate", name, some) for some in (records, falsified(records)))
     assert {name for name in before if before[name] != after[name]} >= {"detect.candidates", "telemetry.drone_odometry"}

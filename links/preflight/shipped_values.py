@@ -32,7 +32,7 @@ def shipped_values(graph: Graph) -> list[str]:
             texts.append(
                 f"rig.odometry is not set: the poses of `{name}` count as those of the vehicle's camera. "
                 "Set T_vehicle_reference to the pose of their reference point (base_link, INS), or `odometry: {}` if "
-                "they are; 1.4 m off is 2.8 m in a U-turn"
+                "they are; 1.4 m that are not stated are an error of 2.8 m after a U-turn"
             )
         if isinstance(node, Source):
             texts += [f"{name}.{text}" for text in _source(node, spec.config)]

@@ -9,7 +9,7 @@ from flow.link import Record, Source
 from links.preflight.check_result import CheckResult, fail, ok, warning
 from links.preflight.link_checks import LinkChecks, declares
 from links.preflight.observations import Observation, Observations, ObservedSource
-from links.udp import MAX_AGE_S, WRONG_AGE
+from links.udp import MAX_AGE_S, MAX_AHEAD_S, WRONG_AGE
 from links.vehicle_odometry.odometry import TILTED, VehicleOdometry
 from stages.geometry.trajectory import RECENT_NS, same_vertical
 from stages.messages import VehicleMotion
@@ -56,8 +56,8 @@ class VehicleOdometryChecks(LinkChecks):
             if not observation.has_age:
                 yield warning(
                     f"{source.name} age",
-                    "its poses have no age_s: they count as new when they are sent, and an error of 0.1 s in a turn of "
-                    f"30 deg/s is 0.8 m at 15 m; send age_s, or set {source.name}.latency_s",
+                    "its poses have no age_s, so their latency is taken as 0; an error of 0.1 s in a turn of 30 deg/s "
+                    f"is 0.8 m at 15 m: send age_s, or set {source.name}.latency_s",
                 )
         motions = observations.all(VehicleMotion)
         if motions and all(same_vertical(motion.R_map_vehicle, motions[0].R_map_vehicle) for motion in motions):
@@ -75,25 +75,26 @@ def odometry_check(source: ObservedSource, link: VehicleOdometry) -> CheckResult
         return warning(source.name, "no port is set: the vehicle is assumed parked")
     records = source.observation.records
     wrong_age = source.counters.get(WRONG_AGE, 0)
-    why_age = f"{wrong_age} poses with an age_s that is invalid or above {MAX_AGE_S:g} s: check the sender's clock"
+    limits = f"not from {-MAX_AHEAD_S:g} to {MAX_AGE_S:g} s"
+    why_age = f"{wrong_age} poses with an age_s that is {limits}: check age_s and the sender's clock"
+    if not records.count and wrong_age:
+        return fail(source.name, why_age)
     if not records.count:
-        reason = why_age if wrong_age else source.no_data_reason
-        text = f"{reason}: the vehicle would be assumed parked"
+        text = f"{source.no_data_reason}: the vehicle would be assumed parked"
         return fail(source.name, f"{text}; start it, or set port: null") if source.live else warning(source.name, text)
     rejected, age_ms = sum(source.counters.rejected.values()), 1e-6 * records.max_age_ns
     text = f"{records.rate_hz:.0f} poses/s, at most {age_ms:.0f} ms old" + (
         f", {rejected} rejected" if rejected else ""
     )
+    if source.counters.rejected.get(TILTED):
+        asked = "is the quaternion x, y, z, w, and z up? If z is down, set rig.odometry.axes to frd"
+        return fail(source.name, f"{text}: {TILTED}: {asked}")
     if rejected >= records.count:
         return fail(source.name, f"{text}: none is a valid pose (recordings/README.md, /vehicle/odometry)")
-    if source.counters.rejected.get(TILTED):
-        return fail(
-            source.name, f"{text}: {TILTED}: is the quaternion x, y, z, w, and z up (rig.odometry.axes: frd if down)?"
-        )
     silent_s = records.longest_silence_s(source.end_ns)
     if source.live and silent_s + 1e-3 * age_ms >= RECENT_S:
-        text += f"; none for {silent_s:.1f} s: above {RECENT_S:g} s with its age the vehicle's motion is unknown"
-        return fail(source.name, f"{text}. Is its sender still running?")
+        text += f"; no pose for {silent_s:.1f} s, and {RECENT_S:g} s after a pose the vehicle's motion is unknown"
+        return fail(source.name, f"{text}: is its sender still running, and fast enough?")
     if wrong_age:
         return warning(source.name, f"{text}; {why_age}")
     if not records.rate_hz >= ODOMETRY_HZ or age_ms > OLD_MS or rejected:

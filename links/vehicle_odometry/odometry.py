@@ -3,7 +3,7 @@
     {"xyz_m": [x, y, z], "quaternion_xyzw": [x, y, z, w], "covariance": [36 numbers] or null, "age_s": 0.004}
 
 They are those of the odometry's reference point (`rig.odometry`) in a frame whose z axis is vertical. A vehicle that is
-tilted by more than MAX_TILT_DEG is a wrong order of the quaternion, or wrong axes.
+tilted by more than MAX_TILT_DEG shows a quaternion in another order, or other axes: the pose is rejected.
 
 A recording without it is no error: the source has no records, and the run reports that once.
 

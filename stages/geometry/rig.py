@@ -81,8 +81,8 @@ class RigCameras(StrictModel):
 class RigOdometry(StrictModel):
     """`rig.odometry`: what the poses of the vehicle's odometry are poses of."""
 
-    T_vehicle_reference: Pose = Pose()  # its reference point (base_link, INS) in frame vehicle, with its axes
-    axes: Literal["flu", "frd"] = "flu"  # x forward, y left, z up, also of its frame; frd: y right, z down, as in NED
+    T_vehicle_reference: Pose = Pose()  # its reference point (base_link, INS), with axes x forward, y left, z up
+    axes: Literal["flu", "frd"] = "flu"  # of its poses and their frame: z up; frd: z down, as in NED
 
 
 class Rig(StrictModel):

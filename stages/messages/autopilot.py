@@ -95,7 +95,7 @@ class AutopilotEstimator(Message):
 
 @message(schema=85)
 class EarlierOdomFrame(Message):
-    """Frame odom in `map`, R_map_odom = Rz(yaw), as an earlier run of grd knew it at a pose that it sent."""
+    """Frame odom in `map`, R_map_odom = Rz(yaw), as it was known at a pose that was sent before a restart."""
 
     yaw_map_odom_rad: float
     sigma_rad: float  # of the yaw

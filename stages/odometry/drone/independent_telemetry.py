@@ -3,17 +3,18 @@
     DroneLocalPosition, DroneOdometry, DroneAttitude,
     DroneGlobalPosition                                passed on while `independent`, else dropped
     DroneTilt                                          always: roll and pitch of DroneAttitude, never its yaw
-    HeadingPrior                                       for PRIOR_S after the newest pose of an earlier run of grd
+    HeadingPrior                                       for PRIOR_S after the newest pose before a restart
 
 Position, velocity and yaw of an autopilot that fuses poses of grd are those poses: used as odometry, they confirm any
 error of grd, and the loop diverges. Roll and pitch come from its accelerometer; their sigma is larger then, because an
 acceleration that it derives from a wrong pose tilts them. Its angular rate contains the gyro bias that it estimates;
 then the rate of a raw IMU sample replaces it.
 
-After a restart in flight the yaw that the earlier run knew is propagated by the autopilot, which then has its gyros and
-the compass or the poses of that run. The prior is a memory of grd's own pose, not a measurement. It is wrong if frame
-odom has changed meanwhile, by another source set or a reset; a reboot ends it, because the estimate is independent
-then. Its position drifts with the velocity's error, SPEED_SHARE of the speed, and as an IMU does (DRIFT_MPS2).
+After a restart of grd, or of stage `fuse`, in flight the yaw that was known before is propagated by the autopilot,
+which then has its gyros and the compass or the poses sent before. The prior is a memory of grd's own pose, not a
+measurement. It is wrong if frame odom has changed meanwhile, by another source set or a reset; a reboot ends it,
+because the estimate is independent then. Its position drifts with the velocity's error, SPEED_SHARE of the speed, and
+as an IMU does (DRIFT_MPS2).
 
 Source: ours; DRIFT_MPS2 by a LiDAR gap of 5 s in simulation, bridged by the IMU alone: 1.4 m of error. SPEED_SHARE by
 six simulated flights at 5 m/s whose source set has no velocity: 2 s after the end of grd the horizontal position is 0.5
